@@ -250,12 +250,12 @@ def _free_spot(
     i: int,
     j: int,
     obstacles: Bool[NDArray, "n"],
-    reach: float,
-    margin: float,
-    z: float,
+    reach: float,  # largest distance from the centre of j, as a share of its extents
+    margin: float,  # metres by which j is enlarged on each side
+    z: float,  # height of the bottom of i
     rng: Rng,
 ) -> Float[NDArray, "3"] | None:
-    """Return a centre of instance i at height z near j, clear of the obstacles, or None."""
+    """Return a random centre of instance i near j, clear of the obstacles, or None."""
     obstacles = obstacles & boxes.usable & ~boxes.group(i)
     for _ in range(_ATTEMPTS):
         point = boxes.beside(j, rng.uniform(-reach, reach, 2), margin)

@@ -308,6 +308,7 @@ def evidence_cases(
         things = classes[~structure[classes]]
         if len(things) < 3 or (kind == "poses" and encoded.instance_positions is None):
             continue
+        # A relation needs two classes, so the evidence is about at least two of them.
         half = scene_rng(encoded, seed).permutation(things)[: max(2, len(things) // 2)]
         in_half, is_thing = np.isin(instances, half), ~structure[instances]
         between = in_half[:, None] & in_half
@@ -332,6 +333,7 @@ def relations_evidence_task(artifact: SceneModel, setting: Setting) -> Outcome |
     skipped: list[int] = []
 
     def ask(case: Case) -> Float[NDArray, " 2"]:
+        """Return the expected hits without and with the evidence of a case."""
         count, truth = int(case.truth.sum()), case.truth[case.queried]
         bare = replace(case.scene, relations=None)
         p = (relation_probabilities(artifact, scene) for scene in (bare, case.scene))

@@ -242,10 +242,7 @@ def _line(points: Sequence[tuple[float, float]], least: float) -> AlarmLine:
 
 
 def hardest_quantile(values: Float[NDArray, "N"], sources: NDArray[np.str_], share: float) -> float:
-    """Return the highest quantile over the large sources, since a robot sees one source.
-
-    Small sources count together as one.
-    """
+    """Return the highest quantile over the sources; a robot sees one. Small ones count as one."""
     names, sizes = np.unique(sources, return_counts=True)
     small = np.isin(sources, names[sizes < _SOURCE_SCENES])
     masks = [sources == name for name in names[sizes >= _SOURCE_SCENES]]

@@ -147,14 +147,11 @@ class _Cases(Table):
 def _features(
     part: Part, k: int, start: int
 ) -> tuple[Int[NDArray, "columns"], Float[NDArray, "columns"]]:
-    """Return columns and values for the k-th class of a part; classes begin at `start`.
-
-    The other listed classes together have a vector of length 1, so long lists do not weigh more.
-    """
+    """Return columns and values for the k-th class of a part; classes begin at `start`."""
     others, listed = np.delete(part.classes, k), np.delete(part.listed, k)
     columns = [INTERCEPT, SINGLE, SEVERAL, *(start + others).tolist()]
     values = [1.0, float(part.listed[k] == 1), float((listed > 1).any())]
-    values += [1 / math.sqrt(max(len(others), 1))] * len(others)
+    values += [1 / math.sqrt(max(len(others), 1))] * len(others)  # a vector of length 1
     if part.room >= 0:
         columns.append(ROOM + part.room)
         values.append(1.0)

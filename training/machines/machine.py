@@ -124,8 +124,6 @@ class BoltzmannMachine(nn.Module, ABC):
         doubled = V * (V + 1) // 2 if self.spec.coupled else 0
         return sum(parameter.numel() for parameter in self.parameters()) - doubled
 
-    # ------------------------------------------------------------------ hidden units and objects
-
     @property
     def couplings(self) -> Float[Tensor, "V V"] | None:
         """The symmetric couplings between classes, with a diagonal of 0, or None."""
@@ -236,8 +234,6 @@ class BoltzmannMachine(nn.Module, ABC):
             free = free - (v * self.room_bias(room)).sum(-1)
         log_states = self._all_states(self.hidden_logits(v, room)).logsumexp(-1).sum(-1)
         return free - self.room_rate(room, source) - log_states
-
-    # ---------------------------------------------------------------------------------- relations
 
     @abstractmethod
     def start_relations(

@@ -269,8 +269,8 @@ class _RoomCounts(NamedTuple):
     def table(
         self, alpha: float, exponent: float, absent: bool
     ) -> tuple[Float[Tensor, " C"], Float[Tensor, "C V"]]:
-        """Return the bias of each room type and the weights of the classes."""
-        average = (self.present.sum(0) + 0.5) / (self.labelled.sum(0) + 1.0)
+        """Return biases and weights of naive Bayes; with `absent`, absent classes are evidence."""
+        average = (self.present.sum(0) + 0.5) / (self.labelled.sum(0) + 1.0)  # p(j)
         p = (self.present + alpha * average) / (self.labelled + alpha)
         prior = ((self.scenes + 0.5) / (self.scenes + 0.5).sum()).log()
         without = torch.log1p(-p) * absent

@@ -69,7 +69,7 @@ _SHARPNESS = (4.0, 8.0, 12.0)
 
 
 def nearest_score(lists: Lists, *, neighbours: int, sharpness: float) -> ObjectScore:
-    """Return a score function from presence to log-odds."""
+    """Return a score function from the presence of classes to kNN log-odds of all classes."""
     popularity, v = lists.frequency(), lists.filled()
     index = normalize(lists.v, dim=1).T.contiguous()
 
@@ -371,7 +371,7 @@ def autoencoder(train: SceneTensors, structure: Structure, seed: int) -> Proposa
     lists = dict(training_lists(train, structure))
 
     def fit(setting: dict[str, Any], share: float) -> Iterator[tuple[Parameters, ObjectScore]]:
-        options = setting.copy()
+        options = setting.copy()  # what remains after the pops are options of `train_network`
         chosen = lists[options.pop("scenes")]
         sizes = {name: options.pop(name) for name in ("width", "dropout")}
         with torch.random.fork_rng(devices=[]):
