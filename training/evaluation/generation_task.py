@@ -112,8 +112,8 @@ def held_out_scenes(evidence: Evidence) -> Drawn:
     if not given.any():
         return Drawn(scenes.v, contradictions)
     rng = np.random.default_rng(evidence.seed)
-    fits = given.float() @ (scenes.v == 0).float().T == 0
-    index = torch.tensor([int(rng.choice(row.nonzero().squeeze(1).numpy())) for row in fits])
+    has_given = given.float() @ (scenes.v == 0).float().T == 0  # scenes with all given classes
+    index = torch.tensor([int(rng.choice(row.nonzero().squeeze(1).numpy())) for row in has_given])
     return Drawn(scenes.v[index], contradictions[index])
 
 

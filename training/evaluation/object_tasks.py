@@ -125,7 +125,7 @@ def removed_places(
     scenes: SceneTensors, structure: Structure, seed: int = 0
 ) -> tuple[Int[Tensor, " N"], Int[Tensor, " N"], Places]:
     """Return the indices of the scenes, the removed classes, and their places."""
-    removals: list[tuple[int, int, int, int, bool]] = []
+    removals: list[tuple[int, int, int, int, bool]] = []  # the columns of `table` below
     for k, scene in enumerate(scenes.scenes):
         evidence = scene.evidence
         is_thing = ~structure.numpy()[evidence.classes]

@@ -192,10 +192,10 @@ def draw_false_triple(
     A, n, _ = holds.shape
     relation, subject, object_ = true_triples[rng.integers(len(true_triples))].tolist()
     for _ in range(_TRIES):
-        part, new_class = rng.random(), int(rng.integers(n))
-        if part < 0.5:
+        change, new_class = rng.random(), int(rng.integers(n))
+        if change < 0.5:
             a, i, j = int(rng.integers(A)), subject, object_
-        elif part < 0.75:
+        elif change < 0.75:
             a, i, j = relation, subject, new_class
         else:
             a, i, j = relation, new_class, object_

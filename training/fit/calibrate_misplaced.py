@@ -129,7 +129,7 @@ def _cases(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int) -> _
 def _questions(
     artifact: SceneModel, encoded: EncodedScene, seed: int
 ) -> Iterator[tuple[Scene, Triple | int | None]]:
-    """Yield scenes, and the wrong triple, moved object or None."""
+    """Yield scenes with their wrong entry: a triple, the index of the moved object, or None."""
     structure, places = artifact.vocabulary.structure, artifact.places
     classes, rng = encoded.instance_classes.tolist(), scene_rng(encoded, seed)
     triples = draw_true_relations(encoded, structure, rng)

@@ -46,6 +46,7 @@ def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
     if not len(observed):
         return None
     A = len(CANONICAL)
+    # Six columns: the means of x, y and z, and then their variances.
     relation, scenes_of = np.zeros((A, 6)), np.zeros(A, dtype=np.int32)
     effects = np.zeros((2, A, V, 6))
     pair, moments, counts = [], [], []

@@ -211,7 +211,7 @@ def _supporters(
         if len(of_object):
             yield i, int(classes[i]), of_object
         elif observed.has_boxes or supports[i].any():
-            yield i, int(classes[i]), np.array([len(structure)])
+            yield i, int(classes[i]), np.array([len(structure)])  # the supporter "nothing"
 
 
 def supporter_table(
