@@ -72,7 +72,7 @@ def annotated_relations(encoded: EncodedScene) -> Bool[NDArray, "A N N"]:
     # `unlisted` is the meaning of an unlisted relation a of the source, such as "off" (false).
     for a, unlisted in enumerate(meaning_of(encoded.source, listed=positions is None).unlisted):
         if a in LATERAL and positions is not None and unlisted != "unobserved":
-            # Positions show left and front of every pair, but one camera frame leaves out pairs.
+            # Positions show left and front of every pair. Those of a camera frame do not count.
             located: Bool[NDArray, "N"] = np.all(np.isfinite(positions), axis=1)
             annotated[a] = located[:, None] & located & ~np.eye(len(located), dtype=np.bool_)
             annotated[a] &= not of_one_view

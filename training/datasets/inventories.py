@@ -134,7 +134,7 @@ def _stands(row: Row) -> dict[str, float]:
         shares = {}
     is_valid = set(shares) <= set(_PLACES) and len(words) == 2 * len(shares)
     is_valid = is_valid and all(0 < share <= 1 for share in shares.values())
-    if not is_valid or abs(sum(shares.values()) - 1) > 0.011:
+    if not is_valid or abs(sum(shares.values()) - 1) > 0.011:  # the shares are rounded
         places = ", ".join(_PLACES)
         problem = f"must list shares that add up to 1, such as `floor .9 inside .1`; of {places}"
         raise row.error("stands", problem)

@@ -194,8 +194,7 @@ class _Layout:
             yaw = self.rng.choice([0.0, math.pi / 2]) + self.rng.normal(0.0, 0.05)
             z = size[2] / 2 if piece.where == "centre" else _HEIGHT - size[2] / 2
             return _Box(piece.label, x, y, z, size, float(yaw))
-        # The back of a piece is its -y side. The back touches one of the walls y = 0, x = width,
-        # y = depth and x = 0.
+        # The back of a piece, its -y side, touches a wall: y = 0, x = width, y = depth or x = 0.
         side = int(self.rng.integers(4))
         length = self.width if side % 2 == 0 else self.depth
         if size[0] > length:

@@ -328,8 +328,9 @@ def generated_rooms_task(artifact: SceneModel, setting: Setting) -> Outcome | No
         if mask.sum() >= _FEWEST:
             metrics[name] = Ratio.of_scenes(refused * mask, mask)
     whole = np.array([source_of(scene.source).whole_rooms for scene in scenes.scenes], np.bool_)
-    sizes = present.sum(1).double().numpy()
-    for name, mask in {FREE: whole, **{n: m & whole for n, m in of_type.items()}}.items():
+    sizes = present.sum(1).double().numpy()  # numbers of classes
+    whole_of_type = {name: mask & whole for name, mask in of_type.items()}
+    for name, mask in {FREE: whole, **whole_of_type}.items():
         if mask.sum() >= _FEWEST:
             drawn = _drawn_size(artifact, types.get(name), things, setting.seed)
             change, groups = _size_change(drawn, sizes[mask]), scenes.group_ids[mask]

@@ -154,8 +154,9 @@ def leave_one_out_at(
     """Return the rank of every removed class, as of `rank_hidden`, and its relation."""
     row, target, places = removed_places(scenes, structure, seed)
     related = scenes.relatives_of(places.v)
-    kept = ~related.gather(1, target.unsqueeze(1)).squeeze(1)
-    row, target, places, related = row[kept], target[kept], places.rows(kept), related[kept]
+    # The service never proposes a class of one family with a listed class, so it has no rank.
+    mask = ~related.gather(1, target.unsqueeze(1)).squeeze(1)
+    row, target, places, related = row[mask], target[mask], places.rows(mask), related[mask]
     values = ask_rows(lambda *columns: score(Places(*columns)), *vars(places).values(), block=16)
     values = values.masked_fill((places.v > 0) | structure | related, -torch.inf)
     return Ranking.of(row, target, values, len(scenes)), places.relation.numpy()

@@ -286,7 +286,6 @@ def _places(places: Places, old: int, new: int) -> Places:
     """Return the counts of places for `new` instead of `old` classes. New classes are rare."""
 
     def averaged(table: NDArray[Any]) -> NDArray[Any]:
-        """Return the table with the mean of the old rows for each new class."""
         mean = table.mean(0, keepdims=True).repeat(new - old, 0)
         return np.concatenate([table, mean.astype(table.dtype)])
 

@@ -177,7 +177,7 @@ class _ListedRooms(Table):
 
 def _fit_limit(artifact: SceneModel, lists: Sequence[_ListedRooms], room: int) -> FitLimit:
     """Return the limit of the fit from lists of a room type, one entry for each of `_PARTS`."""
-    # A quantile of few whole rooms is that of the worst: a small machine cannot follow.
+    # The quantile over few whole rooms is the worst room, so only the smallest parts count then.
     lists = lists if len(np.unique(lists[0].scene)) >= _LONG_SCENES else lists[:1]
     quantiles = []
     for parts in lists:

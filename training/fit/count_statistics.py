@@ -64,7 +64,7 @@ def fit_counts(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> Counts
     scenes = at_most(scenes, lambda scene: (scene.source, scene.group), _OF_GROUP)
     counted = {source: classes & (most > 0) for source, classes in counted.items()}
     cases = _Cases.of(scenes, counted, vocabulary)
-    most *= _is_better_than_mean(scenes, cases, most, counted, vocabulary)
+    most *= _is_better_than_mean(scenes, cases, most, counted, vocabulary)  # 0: no statistics
     cases = cases.rows(most[cases.index] > 0)
     return _fit(cases, most, vocabulary) if (most > 1).any() else None
 

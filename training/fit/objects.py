@@ -297,6 +297,7 @@ class ObjectFit:
             rates.copy_(complete - mix)
             bias.add_(mix)
         served = served.clamp(min=_UNSERVED)
+        # p(q) becomes the share of the source in the served mix, instead of that in training.
         machine.f.add_((served / served.sum() * scenes.size / scenes.source_sizes).log())
 
 

@@ -87,8 +87,8 @@ def change_by_relations(
     is_unit = observed[0] & (machine.gate(edges, v)[0] > 0)
     log_p = (r[0] * logits - torch.nn.functional.softplus(logits))[:, is_unit].sum(1)
     weight = log_p.softmax(0)
-    raised = (h1 @ machine.W.T).exp()
-    return (weight @ raised).log() - raised.mean(0).log()
+    factors = (h1 @ machine.W.T).exp()  # exp(W_i h1) of each draw and class i
+    return (weight @ factors).log() - factors.mean(0).log()
 
 
 @torch.no_grad()

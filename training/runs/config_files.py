@@ -117,6 +117,7 @@ def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
     values = config.model_dump()
     for name, value in settings.items():
         section, _, entry = name.partition(".")
+        # The fields of the section; none if the configuration has no section of this name.
         entries = getattr(type(getattr(config, section, None)), "model_fields", {})
         if entry not in entries:
             choice = f"{section} has {', '.join(entries)}" if entries else "name it section.entry"
