@@ -285,6 +285,6 @@ def _footprints(boxes: Sequence[_Box]) -> tuple[Floats, Floats, Floats]:
 
 
 def _point_on(box: _Box, along: float, across: float) -> tuple[float, float]:
-    """Return a point by its distances (m) from the centre: along the front, away from the back."""
+    """Return the point `along` metres along the front of a box, and `across` off its back."""
     cos, sin = math.cos(box.yaw), math.sin(box.yaw)
     return box.x + cos * along - sin * across, box.y + sin * along + cos * across

@@ -283,7 +283,7 @@ def _counts(counts: Counts, C: int, rooms: int, classes: int) -> Counts:
 
 
 def _places(places: Places, old: int, new: int) -> Places:
-    """Return the counts of places for `new` instead of `old` classes. New classes are rare."""
+    """Return the places for `new` instead of `old` classes. New ones get the lowest frequency."""
 
     def averaged(table: NDArray[Any]) -> NDArray[Any]:
         mean = table.mean(0, keepdims=True).repeat(new - old, 0)

@@ -106,7 +106,7 @@ def _cases(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int) -> _
             entries = entries_of(artifact, Posterior(artifact, bare), bare)
             is_wrong, usable = _truth(entries, wrong)
             usable &= np.isin(entries.kind, shown)
-            # Leave out listed relations above that come from boxes, or that counts explain.
+            # Leave out listed relations above of scenes with boxes, and those with an explanation.
             listed_of_boxes = not bare.has_boxes and encoded.instance_positions is not None
             explained = listed_of_boxes | (entries.terms[:, 0] >= EXPLAINED)
             usable &= (entries.kind != OVER) | ~explained

@@ -95,7 +95,7 @@ def calibrate_objects(
 
 
 def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
-    """Draw scenes with complete lists, else of all, each with its weight as probability."""
+    """Keep complete scenes (without any, all), each with its weight as the probability."""
     rng = np.random.default_rng(seed)
     complete = scenes.complete.numpy()
     complete = complete if complete.any() else ~complete
@@ -208,11 +208,11 @@ def _mean_reciprocal_rank(log_odds: Float[NDArray, "N V"], parts: _Lists) -> flo
 def _first_classes(
     log_odds: Float[NDArray, "N V"], parts: _Lists
 ) -> tuple[Float[NDArray, "k"], Int[NDArray, "k"], Bool[NDArray, "k"]]:
-    """Return log-odds, part, and whether it is hidden, of the `_LISTED` likeliest candidates."""
+    """Return log-odds, part and truth (hidden) of the `_LISTED` likeliest candidates of parts."""
     keys = np.where(parts.candidates, -log_odds, np.inf)
     first = np.argsort(keys, axis=1, kind="stable")[:, :_LISTED]
     rows = np.broadcast_to(np.arange(len(log_odds))[:, None], first.shape)
-    # Of few candidates, others are among the first. A source shows only its annotated classes.
+    # With few candidates, other classes fill the list. Unannotated classes have no known truth.
     usable = (parts.candidates & parts.annotated)[rows, first]
     row, classes = rows[usable], first[usable]
     return log_odds[row, classes].astype(np.float64), row, parts.hidden[row, classes]

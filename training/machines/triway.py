@@ -66,7 +66,7 @@ class Triway(BoltzmannMachine):
         self.M = nn.Parameter(torch.zeros(A, K, H1))
         self.P = nn.Parameter(torch.zeros(A, H1))
         self.n = nn.Parameter(torch.zeros(A, 2))
-        self.usual = nn.Parameter(torch.zeros(V))  # mean log count of a class, where n is unknown
+        self.usual = nn.Parameter(torch.zeros(V))  # mean log n_i, used if n_i is unknown
         self.residual = nn.Parameter(torch.zeros(spec.T))  # w'
         if spec.G:
             self.gamma = nn.Parameter(torch.zeros(1 + spec.G, A, feature_count(A)))

@@ -80,7 +80,7 @@ def save_run(
 def _write(
     folder: Path, config: Config, result: TrainingResult, data: Path | None, scenes: str
 ) -> None:
-    """Write the files of a run into an empty folder. `data` and `scenes` are in `FinishedRun`."""
+    """Write the files of a run. `data` is the folder of its scenes, and `scenes` their digest."""
     machine = result.machine
     state = {name: tensor.contiguous() for name, tensor in machine.state_dict().items()}
     spec = json.dumps(machine.spec.to_dict())

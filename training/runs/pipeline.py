@@ -124,7 +124,7 @@ def _path(source: str, root: Path) -> Path:
 
 
 def _require_files(data: DataConfig, root: Path) -> None:
-    """Raise ConfigError with all missing files of scenes and an advice."""
+    """Raise ConfigError if files of scenes are missing. It names them, and the remedy."""
     paths = {source: _path(source, root) for source in data.sources if source != "rooms"}
     missing = {source: path for source, path in paths.items() if not path.is_file()}
     if not missing:
