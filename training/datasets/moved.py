@@ -94,13 +94,13 @@ def moved_by_triple(
         if len(anchors := np.flatnonzero(strange[i])):
             k = int(rng.choice(anchors))
             # Without the other supports of i, and without relations between i and j or k.
-            kept = [
+            others = [
                 (a, x, y)
                 for a, x, y in triples
                 if {x, y} not in ({i, j}, {i, k}) and not (a in SUPPORTS and x == i)
             ]
             every = range(len(encoded.instance_classes))
-            return scene_of(encoded, every, [*kept, (ON_TOP, i, k)]), i
+            return scene_of(encoded, every, [*others, (ON_TOP, i, k)]), i
     return None
 
 

@@ -147,13 +147,13 @@ class _Layout:
         """Return a view of the room from the middle of a random wall."""
         viewpoints = side_viewpoints(0.0, 0.0, self.width, self.depth)
         viewpoint = viewpoints[int(self.rng.integers(4))]
-        kept = [
+        seen = [
             (index, box)
             for index, box in enumerate(self.boxes)
             if box.support is None or self.rng.random() >= _GONE
         ]
         positions, yaws = to_viewer_frame(
-            [(box.x, box.y, box.z) for _, box in kept], viewpoint, [box.yaw for _, box in kept]
+            [(box.x, box.y, box.z) for _, box in seen], viewpoint, [box.yaw for _, box in seen]
         )
         objects = tuple(
             AnnotatedObject(
@@ -165,7 +165,7 @@ class _Layout:
                 supported_by=None if box.support is None else str(box.support),
             )
             for (index, box), position, yaw in zip(
-                kept, positions.tolist(), yaws.tolist(), strict=True
+                seen, positions.tolist(), yaws.tolist(), strict=True
             )
         )
         scene_id = f"{group}-{number}"
@@ -208,7 +208,7 @@ class _Layout:
         )[side]
         z = size[2] / 2
         if piece.where == "hung":
-            z = min(self.rng.uniform(1.5, 1.8), _HEIGHT - 0.05 - size[2] / 2)
+            z = min(self.rng.uniform(1.5, 1.8), _HEIGHT - 0.05 - size[2] / 2)  # eye height
         return _Box(piece.label, x, y, z, size, side * math.pi / 2)
 
     def _add(self, piece: Piece, box: _Box) -> None:

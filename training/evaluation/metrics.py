@@ -267,8 +267,8 @@ class Scored(Metric):
 
     def _weights(self, weight: Float[NDArray, " G"]) -> Levels:
         scores, level = self._levels
-        each = weight[self.unit]
-        counts = (np.bincount(level, w, len(scores)) for w in (each, each * self.truth))
+        of_item = weight[self.unit]
+        counts = (np.bincount(level, w, len(scores)) for w in (of_item, of_item * self.truth))
         return np.stack([scores, *counts])
 
     def at(self, weight: Float[NDArray, " G"]) -> float:

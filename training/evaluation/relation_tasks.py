@@ -336,8 +336,8 @@ def relations_evidence_task(artifact: SceneModel, setting: Setting) -> Outcome |
         """Return the expected hits without and with the evidence of a case."""
         count, truth = int(case.truth.sum()), case.truth[case.queried]
         bare = replace(case.scene, relations=None)
-        p = (relation_probabilities(artifact, scene) for scene in (bare, case.scene))
-        return np.array([expected_hits(x[case.queried], truth, count) for x in p])
+        answers = (relation_probabilities(artifact, scene) for scene in (bare, case.scene))
+        return np.array([expected_hits(p[case.queried], truth, count) for p in answers])
 
     for kind in OF_RELATIONS:
         cases = list(evidence_cases(scenes, structure, kind, setting.seed))

@@ -299,8 +299,8 @@ def _room_counts(
         room, source = scenes.room[lists.index], scenes.source[lists.index]
         counts = {"": _RoomCounts.of(lists, room, types)}
         for k in source.unique().tolist():
-            part = Lists(*(values[source == k] for values in vars(lists).values()))
-            counts[scenes.source_names[k]] = _RoomCounts.of(part, room[source == k], types)
+            own = Lists(*(values[source == k] for values in vars(lists).values()))
+            counts[scenes.source_names[k]] = _RoomCounts.of(own, room[source == k], types)
         yield name, counts
 
 
