@@ -203,6 +203,7 @@ def publish(
 
 
 def _prepare(config: Config, data: Path) -> SplitScenes:
+    """Read scenes and examples, and print their numbers and what is left out."""
     with console.status("reading and encoding scenes"):
         scenes = prepare(config, data)
     examples, reasons = accepted_examples(read_examples(config.examples, data), scenes.vocabulary)
@@ -234,6 +235,7 @@ def _exit_refused(error: RefusedError, remedy: str = "") -> NoReturn:
 
 
 def _refit(reference: str, root: Path, store: str, version: str) -> None:
+    """Publish a version of a stored model with statistics from the scenes in the folder `root`."""
     models = Store(store)
     name, old = models.resolve(reference)
     models.require_new(name, version)
@@ -267,6 +269,7 @@ def _promote(
     served = served_model(store, alias)
 
     def judge(model: SceneModel, say: Progress) -> list[str]:
+        """Print the comparisons with baselines and the served model; return the objections."""
         useful = measure_usefulness(model, scenes.training_data(), say=say)
         for line in useful.lines():
             console.print(line, highlight=False)

@@ -78,7 +78,7 @@ class SceneTensors:
         classes, counts = np.full(shape[::3], -1), np.ones(shape[::3], dtype=np.int64)
         holds, observed = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.bool_)
         for row, e in enumerate(evidence):
-            m = len(e.classes)
+            m = len(e.classes)  # the rest of the row is padding
             classes[row, :m], counts[row, :m] = e.classes, e.counts
             holds[row, :, :m, :m], observed[row, :, :m, :m] = e.holds, e.observed
         tables = map(torch.from_numpy, (classes, counts, holds, observed))

@@ -67,14 +67,17 @@ def annotated_relations(encoded: EncodedScene) -> Bool[NDArray, "A N N"]:
     """
     positions, of_one_view = encoded.instance_positions, source_of(encoded.source).of_one_view
     annotated = encoded.instance_observed.copy()
-    stacked = encoded.instance_holds[[*STACKED]].any(0)
+    stacked = encoded.instance_holds[[*STACKED]].any(0)  # pairs, in both directions
     stacked |= stacked.T
+    # `unlisted` is the meaning of an unlisted relation a of the source, such as "off" (false).
     for a, unlisted in enumerate(meaning_of(encoded.source, listed=positions is None).unlisted):
         if a in LATERAL and positions is not None and unlisted != "unobserved":
+            # Positions show left and front of every pair. Those of a camera frame do not count.
             located: Bool[NDArray, "N"] = np.all(np.isfinite(positions), axis=1)
             annotated[a] = located[:, None] & located & ~np.eye(len(located), dtype=np.bool_)
             annotated[a] &= not of_one_view
         elif unlisted not in ("off", "off for supported") or (a == ABOVE and positions is not None):
+            # Only true relations are annotated, except left and front of stacked objects.
             annotated[a] &= stacked & (a in LATERAL)
     return annotated
 
@@ -203,7 +206,7 @@ _COUNTING: Final = 0.05
 def counted_classes(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> dict[str, ClassMask]:
     """Return masks of the classes that each source counts. Its object lists must be complete."""
     things = ~vocabulary.structure
-    entries, several = Counter[str](), Counter[str]()
+    entries, several = Counter[str](), Counter[str]()  # classes of scenes, those with instances > 1
     repeated: dict[str, ClassMask] = {}
     for scene in (scene for scene in scenes if scene.complete):
         evidence = scene.evidence

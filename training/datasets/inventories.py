@@ -134,7 +134,7 @@ def _stands(row: Row) -> dict[str, float]:
         shares = {}
     is_valid = set(shares) <= set(_PLACES) and len(words) == 2 * len(shares)
     is_valid = is_valid and all(0 < share <= 1 for share in shares.values())
-    if not is_valid or abs(sum(shares.values()) - 1) > 0.011:
+    if not is_valid or abs(sum(shares.values()) - 1) > 0.011:  # the shares are rounded
         places = ", ".join(_PLACES)
         problem = f"must list shares that add up to 1, such as `floor .9 inside .1`; of {places}"
         raise row.error("stands", problem)
@@ -227,10 +227,11 @@ class _Places:
     """The places of the rows so far."""
 
     def __init__(self) -> None:
-        self.rooms: dict[str, str] = {}
-        self.labels: defaultdict[str, set[str]] = defaultdict(set)
-        self.anchored: list[tuple[Row, str, str]] = []
-        self._shares: dict[tuple[str, str], float] = {}
+        self.rooms: dict[str, str] = {}  # room type of each place
+        self.labels: defaultdict[str, set[str]] = defaultdict(set)  # label keys of each place
+        self.anchored: list[tuple[Row, str, str]] = []  # row, place and anchor
+        self._shares: dict[tuple[str, str], float] = {}  # share of a place that has a group
+        # The items of each group of each place.
         self._items: dict[str, dict[str, list[Item]]] = defaultdict(lambda: defaultdict(list))
 
     def add(self, row: Row) -> None:

@@ -94,13 +94,13 @@ def moved_by_triple(
         if len(anchors := np.flatnonzero(strange[i])):
             k = int(rng.choice(anchors))
             # Without the other supports of i, and without relations between i and j or k.
-            kept = [
+            others = [
                 (a, x, y)
                 for a, x, y in triples
                 if {x, y} not in ({i, j}, {i, k}) and not (a in SUPPORTS and x == i)
             ]
             every = range(len(encoded.instance_classes))
-            return scene_of(encoded, every, [*kept, (ON_TOP, i, k)]), i
+            return scene_of(encoded, every, [*others, (ON_TOP, i, k)]), i
     return None
 
 
@@ -140,6 +140,7 @@ def moved_by_pose(
 
 
 def _shifted(scene: Scene, group: Bool[NDArray, "N"], step: Float[NDArray, "3"]) -> Scene:
+    """Return the scene with the objects of a group moved by a step in metres."""
     objects = tuple(
         replace(thing, position=_point(np.add(thing.position, step)))
         if moves and thing.position is not None
@@ -249,12 +250,12 @@ def _free_spot(
     i: int,
     j: int,
     obstacles: Bool[NDArray, "n"],
-    reach: float,
-    margin: float,
-    z: float,
+    reach: float,  # largest distance from the centre of j, as a share of its extents
+    margin: float,  # metres by which j is enlarged on each side
+    z: float,  # height of the bottom of i
     rng: Rng,
 ) -> Float[NDArray, "3"] | None:
-    """Return a centre of instance i at height z near j, clear of the obstacles, or None."""
+    """Return a random centre of instance i near j, clear of the obstacles, or None."""
     obstacles = obstacles & boxes.usable & ~boxes.group(i)
     for _ in range(_ATTEMPTS):
         point = boxes.beside(j, rng.uniform(-reach, reach, 2), margin)

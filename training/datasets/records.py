@@ -20,7 +20,10 @@ MAX_PROBLEM: Final = 500  # maximum length of the text of a `DatasetError`, in c
 
 
 class DatasetError(ValueError):
-    """A data file cannot be read or has invalid content at a position, such as ``line 3``."""
+    """A data file cannot be read or has invalid content at a position, such as ``line 3``.
+
+    The position `where` is "" if the problem concerns the whole file.
+    """
 
     def __init__(self, path: Path, where: str, problem: str) -> None:
         if len(problem) > MAX_PROBLEM:  # the text can contain a value of several megabytes
@@ -111,6 +114,7 @@ class AnnotatedScene:
     confirmed: bool = field(default=False, repr=False)
 
     def __post_init__(self) -> None:
+        """Check that ids are distinct, and that supports and relations name objects."""
         ids = {thing.id for thing in self.objects}
         if len(ids) < len(self.objects):
             raise ValueError(f"scene {self.scene_id!r} has two objects with the same id")
@@ -130,11 +134,12 @@ class AnnotatedScene:
                 )
 
     def only(self, kept: Sequence[int]) -> AnnotatedScene:
-        """Return the scene with the objects at ascending indices and their relations."""
+        """Return the scene with the objects at the ascending indices `kept` and their relations."""
         index_of = {old: new for new, old in enumerate(kept)}
         ids = {self.objects[k].id for k in kept}
 
         def among(triples: Sequence[tuple[int, str, int]]) -> tuple[tuple[int, str, int], ...]:
+            """Return the triples between two kept objects, with their new indices."""
             return tuple(
                 (index_of[i], name, index_of[j])
                 for i, name, j in triples

@@ -53,20 +53,22 @@ def lift_of(thing: AnnotatedObject, support: AnnotatedObject) -> float | None:
     return (thing.position[2] - thing.size[2] / 2) - (support.position[2] + support.size[2] / 2)
 
 
-def _table(own: Counter[Role], vocabulary: Vocabulary) -> RoleCounts:
+def _table(stated: Counter[Role], vocabulary: Vocabulary) -> RoleCounts:
+    """Count the roles of each pair (key i V + j) and each larger class j, also for their kin."""
     V, kin = len(vocabulary), _kin(vocabulary)
     pairs: defaultdict[int, np.ndarray] = defaultdict(lambda: np.zeros(3, np.float32))
     anchor = np.zeros((V, 3), np.float32)
-    for (role, i, j), count in own.items():
-        for m in kin[j]:
-            anchor[m, role] += (1.0 if m == j else _OF_KIN) * count
-            for k in kin[i]:
-                pairs[k * V + m][role] += (1.0 if (k, m) == (i, j) else _OF_KIN) * count
+    for (role, i, j), count in stated.items():
+        for large in kin[j]:
+            anchor[large, role] += (1.0 if large == j else _OF_KIN) * count
+            for small in kin[i]:
+                weight = 1.0 if (small, large) == (i, j) else _OF_KIN
+                pairs[small * V + large][role] += weight * count
     keys = np.array(sorted(pairs), np.int64)
     counts = np.array([pairs[key] for key in keys.tolist()], np.float32).reshape(-1, 3)
     contains = anchor[:, IN] >= _CONTAINS * np.maximum(anchor[:, ON] + anchor[:, IN], 1)
     for table, rows in ((anchor, contains), (counts, contains[keys % V])):
-        table[rows, IN] += table[rows, ON]
+        table[rows, IN] += table[rows, ON]  # "on" means "in" for classes that contain things
         table[rows, ON] = 0
     return RoleCounts(keys, counts, anchor)
 

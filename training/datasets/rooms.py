@@ -63,6 +63,7 @@ def _read_tables(path: Path) -> dict[str, Rooms]:
     named: dict[str, Piece] = {}
 
     def piece(entry: Any) -> Piece:
+        """Return the piece of a table, or the earlier piece of a name."""
         if isinstance(entry, str):
             return named[entry]
         beside = tuple((piece(e["piece"]), e["side"]) for e in entry.get("beside", ()))
@@ -86,12 +87,12 @@ ROOMS: Final = DOMAINS["homes"]
 @dataclass(frozen=True, slots=True)
 class _Box:
     label: str
-    x: float
+    x: float  # centre in metres
     y: float
     z: float
     size: Size
-    yaw: float
-    support: int | None = None
+    yaw: float  # radians
+    support: int | None = None  # index of the box that carries this small object
 
     @property
     def top(self) -> float:
@@ -132,6 +133,7 @@ class _Layout:
     """One furnished room. The origin is a corner of the room, and the walls run along x and y."""
 
     def __init__(self, rng: Rng, room_type: str, pieces: tuple[Piece, ...]) -> None:
+        """Draw the extents of the room in metres, and furnish it."""
         self.rng = rng
         self.room_type = room_type
         self.width, self.depth = rng.uniform(3.2, 5.5), rng.uniform(3.0, 5.0)
@@ -145,13 +147,13 @@ class _Layout:
         """Return a view of the room from the middle of a random wall."""
         viewpoints = side_viewpoints(0.0, 0.0, self.width, self.depth)
         viewpoint = viewpoints[int(self.rng.integers(4))]
-        kept = [
+        seen = [
             (index, box)
             for index, box in enumerate(self.boxes)
             if box.support is None or self.rng.random() >= _GONE
         ]
         positions, yaws = to_viewer_frame(
-            [(box.x, box.y, box.z) for _, box in kept], viewpoint, [box.yaw for _, box in kept]
+            [(box.x, box.y, box.z) for _, box in seen], viewpoint, [box.yaw for _, box in seen]
         )
         objects = tuple(
             AnnotatedObject(
@@ -163,7 +165,7 @@ class _Layout:
                 supported_by=None if box.support is None else str(box.support),
             )
             for (index, box), position, yaw in zip(
-                kept, positions.tolist(), yaws.tolist(), strict=True
+                seen, positions.tolist(), yaws.tolist(), strict=True
             )
         )
         scene_id = f"{group}-{number}"
@@ -192,7 +194,7 @@ class _Layout:
             yaw = self.rng.choice([0.0, math.pi / 2]) + self.rng.normal(0.0, 0.05)
             z = size[2] / 2 if piece.where == "centre" else _HEIGHT - size[2] / 2
             return _Box(piece.label, x, y, z, size, float(yaw))
-        # The back of a piece is its -y side. The back touches the wall.
+        # The back of a piece, its -y side, touches a wall: y = 0, x = width, y = depth or x = 0.
         side = int(self.rng.integers(4))
         length = self.width if side % 2 == 0 else self.depth
         if size[0] > length:
@@ -206,7 +208,7 @@ class _Layout:
         )[side]
         z = size[2] / 2
         if piece.where == "hung":
-            z = min(self.rng.uniform(1.5, 1.8), _HEIGHT - 0.05 - size[2] / 2)
+            z = min(self.rng.uniform(1.5, 1.8), _HEIGHT - 0.05 - size[2] / 2)  # eye height
         return _Box(piece.label, x, y, z, size, side * math.pi / 2)
 
     def _add(self, piece: Piece, box: _Box) -> None:
@@ -227,9 +229,9 @@ class _Layout:
         if size[0] > base.size[0] or size[1] > base.size[1]:
             return
         for _ in range(_ATTEMPTS):
-            u = self.rng.uniform(-1, 1) * (base.size[0] - size[0]) / 2
-            v = self.rng.uniform(-1, 1) * (base.size[1] - size[1]) / 2
-            x, y = _point_on(base, u, v)
+            along = self.rng.uniform(-1, 1) * (base.size[0] - size[0]) / 2
+            across = self.rng.uniform(-1, 1) * (base.size[1] - size[1]) / 2
+            x, y = _point_on(base, along, across)
             box = _Box(small.label, x, y, base.top + size[2] / 2, size, base.yaw, support=support)
             if self._free(box):
                 self.boxes.append(box)
@@ -243,13 +245,13 @@ class _Layout:
             size = self._random_size(piece.size)
             gap = self.rng.uniform(0.03, 0.15)
             if side in ("left", "right"):
-                u = (anchor.size[0] + size[0]) / 2 + gap
+                along = (anchor.size[0] + size[0]) / 2 + gap
                 # Unless the side is "around", the backs of both pieces touch the same wall.
-                v = 0.0 if where == "around" else (size[1] - anchor.size[1]) / 2
-                x, y = _point_on(anchor, -u if side == "left" else u, v)
+                across = 0.0 if where == "around" else (size[1] - anchor.size[1]) / 2
+                x, y = _point_on(anchor, -along if side == "left" else along, across)
             else:
-                v = (anchor.size[1] + size[1]) / 2 + gap
-                x, y = _point_on(anchor, 0.0, v if side == "front" else -v)
+                across = (anchor.size[1] + size[1]) / 2 + gap
+                x, y = _point_on(anchor, 0.0, across if side == "front" else -across)
             box = _Box(piece.label, x, y, size[2] / 2, size, anchor.yaw)
             if self._inside(box) and self._free(box):
                 self._add(piece, box)
@@ -282,7 +284,7 @@ def _footprints(boxes: Sequence[_Box]) -> tuple[Floats, Floats, Floats]:
     return rows[:, :2], rows[:, 2:4], rows[:, 4]
 
 
-def _point_on(box: _Box, u: float, v: float) -> tuple[float, float]:
-    """Return the point u metres along the front of a box and v metres away from its back."""
+def _point_on(box: _Box, along: float, across: float) -> tuple[float, float]:
+    """Return the point `along` metres along the front of a box, and `across` off its back."""
     cos, sin = math.cos(box.yaw), math.sin(box.yaw)
-    return box.x + cos * u - sin * v, box.y + sin * u + cos * v
+    return box.x + cos * along - sin * across, box.y + sin * along + cos * across

@@ -85,6 +85,7 @@ class _File(BaseModel):
         return Meaning(**self.meanings[like] | entries)
 
     def source(self, entry: dict[str, Any]) -> Source:
+        """Return the source of a table; `without_camera_subjects` leaves out people and animals."""
         own = self.meaning(**entry["meaning"]) if "meaning" in entry else None
         camera_subjects = self.camera_subjects if entry.get("without_camera_subjects") else ()
         left_out = (*camera_subjects, *entry.get("left_out", ()))

@@ -80,7 +80,7 @@ def stable_part(scene: AnnotatedScene, seed: int) -> Part:
 def _families(
     scenes: Sequence[AnnotatedScene], units: Sequence[str]
 ) -> Sequence[Mapping[str, Counter[str]]]:
-    """Count the room types of each unit, for each set of data sources that share units."""
+    """Count the room types of each unit (scenes in one part), by sources that share units."""
     sources_of: dict[str, set[str]] = defaultdict(set)
     sizes: Counter[str] = Counter()
     for scene, unit in zip(scenes, units, strict=True):

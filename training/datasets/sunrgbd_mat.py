@@ -104,7 +104,7 @@ def read_sunrgbd_mat(path: Path) -> list[AnnotatedScene]:
         name = frame.name.strip().strip("/")
         collection = "/".join(name.split("/")[:3])
         if "sun3ddata" in name:
-            group = "sunrgbd-" + "/".join(name.split("/")[:4])
+            group = "sunrgbd-" + "/".join(name.split("/")[:4])  # this path names the place
         else:
             group = f"sunrgbd-{collection}-{counts[collection] // _BLOCK}"
         counts[collection] += 1
@@ -137,12 +137,13 @@ def _check_sizes(path: Path) -> None:
     with path.open("rb") as file:
         content = file.read(MAX_BYTES + 1)
     check_size(path, len(content), MAX_BYTES)
-    orders = {b"\x00\x01IM": "<", b"\x01\x00MI": ">"}
+    orders = {b"\x00\x01IM": "<", b"\x01\x00MI": ">"}  # version and byte order
     if (order := orders.get(content[124:128])) is None:
         raise ValueError("its header names another version")
     size = 0
 
     def check(data: memoryview) -> None:
+        """Add up the sizes of all elements in data, and of those within them."""
         nonlocal size
         for kind, body in _elements(data, order):
             if kind == _COMPRESSED:
@@ -168,7 +169,7 @@ def _elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
             offset += 8
         else:
             yield kind, data[offset + 8 : offset + 8 + size]
-            offset += 8 + size + (-size % 8 if kind != _COMPRESSED else 0)
+            offset += 8 + size + (-size % 8 if kind != _COMPRESSED else 0)  # padded to 8 bytes
 
 
 def _entries(body: memoryview, order: str) -> int:
@@ -181,5 +182,6 @@ def _entries(body: memoryview, order: str) -> int:
     count = abs(math.prod(struct.unpack(f"{order}{len(shape) // 4}i", shape)))
     if kind == _CELL:
         return count
+    # A struct has an entry for each field. The names of the fields have the same `length`.
     _, (_, length), (_, names) = (next(parts, (0, body[:0])) for _ in range(3))
     return count * (len(names) // max(1, struct.unpack_from(f"{order}i", length)[0]))

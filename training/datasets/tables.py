@@ -122,6 +122,7 @@ def read_table(
 
 
 def _decoded(path: Path) -> Iterator[str]:
+    """Yield the lines of a UTF-8 file. Raise DatasetError with the number of an invalid line."""
     for number, line in enumerate(read_lines(path, MAX_LINE), 1):
         try:
             yield line.decode("utf-8-sig")

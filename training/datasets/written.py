@@ -37,8 +37,7 @@ def written_vocabulary() -> Vocabulary:
         for label, thing in sorted(things.items(), key=lambda x: -expected[label_key(x[0])])
         if label_key(label) in indoor_class or expected[label_key(label)] >= LEAST_PLACES
     }
-    # A thing without a class is a name of its nearest broader class.
-    # Names in `things.csv` come before the curated ones.
+    # A thing without a class is a name of its nearest broader class. Curated names come last.
     aliases = _Aliases(classes)
     for thing in things.values():
         label = thing.label if thing.label in classes else _broader(thing, things, classes)
@@ -93,6 +92,7 @@ def with_things(vocabulary: Vocabulary, things: Mapping[str, Thing]) -> Vocabula
 
 
 def _ancestors(label: str | None, parents: Mapping[str, str | None]) -> set[str]:
+    """Return a class and its broader classes: a class below them must not become a parent."""
     ancestors: set[str] = set()
     while label is not None:
         ancestors.add(label)

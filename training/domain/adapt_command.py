@@ -110,15 +110,11 @@ def _parent(store: Store, reference: str, name: str) -> Artifact:
     origin = artifact.manifest.training.get("parent")
     if isinstance(origin, dict):
         artifact = store.load(str(origin["name"]), str(origin["version"]))
-        parent = _reference(artifact)
+        parent = "@".join(artifact.key)
         console.print(f"{reference} is itself adapted; adapting its parent {parent} again")
     if artifact.manifest.name == name:
         raise ConfigError(f"--name {name} is the name of the model itself: choose another name")
     return artifact
-
-
-def _reference(artifact: Artifact) -> str:
-    return "@".join(artifact.key)
 
 
 def _next_version(store: Store, name: str) -> str:
@@ -143,7 +139,7 @@ def _print_home(home: Home, parent: Artifact) -> None:
     """Print the numbers of scenes, new words, and objects without influence."""
     lines = [
         f"{home.recorded} recorded scenes; {len(home.scenes) - len(home.written)} distinct scenes, "
-        f"{home.confirmed} of these confirmed; model {_reference(parent)}"
+        f"{home.confirmed} of these confirmed; model {'@'.join(parent.key)}"
     ]
     if n := len(home.written):
         lines.append(f"{n} written place{'s' if n > 1 else ''}, each as one confirmed scene")
@@ -233,12 +229,12 @@ def _description(
 
 def _calibration(home: Home, model: SceneModel) -> Calibration:
     """Return the calibration, with the popularity of the new classes in the home."""
-    calibration, V = model.calibration, home.parent_classes
+    calibration, old = model.calibration, home.parent_classes  # new classes follow the old ones
     if not calibration.popularity:
         return calibration
-    count, n = home.tensors.v.sum(0)[V:].double().numpy(), len(home.scenes)
-    odds = np.log((count + 0.5) / (n - count + 0.5))
-    popularity = (*calibration.popularity[:V], *np.round(odds, 4).tolist())
+    count, scenes = home.tensors.v.sum(0)[old:].double().numpy(), len(home.scenes)
+    log_odds = np.log((count + 0.5) / (scenes - count + 0.5))
+    popularity = (*calibration.popularity[:old], *np.round(log_odds, 4).tolist())
     return calibration.model_copy(update={"popularity": popularity})
 
 
@@ -258,7 +254,7 @@ def _metrics(measured: Measured | None, source: str) -> Iterable[Metric]:
 
 def _print_next(store: Store, root: str, artifact: Artifact, alias: str | None) -> None:
     """Print the published version. Move the alias, or print how to move it."""
-    reference = _reference(artifact)
+    reference = "@".join(artifact.key)
     console.print(f"published {reference}, digest {artifact.digest[:12]}")
     if alias is None:
         command = f"python -m app.registry alias default {reference} --store {shlex.quote(root)}"

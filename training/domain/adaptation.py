@@ -171,7 +171,7 @@ def _alarms(home: Home, index: Int[NDArray, "N"], sides: Sides) -> Bool[NDArray,
 def _change(home: Home, weights: Weights, recorded: torch.Tensor, seed: int) -> float:
     """Return the mean change of the probability of unrecorded classes in stored samples."""
     samples = torch.from_numpy(home.parent.weights.chain_samples)
-    samples = samples[samples.sum(1) >= 2][:256]
+    samples = samples[samples.sum(1) >= 2][:256]  # a part needs two classes; 256 suffice for a mean
     parts = random_parts(samples, _LEAVE_ONE_OUT, torch.Generator().manual_seed(seed))
     before, after = (
         machine_of(side).object_log_odds(parts.listed, share=parts.share).sigmoid()
@@ -179,5 +179,6 @@ def _change(home: Home, weights: Weights, recorded: torch.Tensor, seed: int) -> 
     )
     other = ~recorded & torch.from_numpy(~home.parent.vocabulary.structure)
     other[home.parent_classes :] = False
+    # Most classes are improbable in a room. They would hide the changes of the others.
     counted = (other & (parts.listed == 0) & (torch.maximum(before, after) > 0.01)).float()
     return float(((after - before).abs() * counted).sum() / counted.sum().clamp(min=1))

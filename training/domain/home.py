@@ -273,6 +273,7 @@ def with_confirmed(artifact: SceneModel, triples: Iterable[Triple]) -> SceneMode
     if places is None:
         return artifact
     misplaced = artifact.calibration.misplaced.model_copy(update={"confirmed": tuple(triples)})
+    # The keys of relation a between classes i and j; scene counts of equal keys are added.
     new = np.array([(a * V + i) * V + j for a, i, j in triples], places.triple.dtype)
     keys, index = np.unique(np.concatenate([places.triple, new]), return_inverse=True)
     scenes = np.bincount(index, np.concatenate([places.triple_scenes, np.full(len(new), _SCENES)]))

@@ -197,7 +197,7 @@ def _split(scenes: Sequence[AnnotatedScene]) -> tuple[int, dict[str, int], int]:
     for seed in range(_SPLIT_SEEDS):
         scenes_of = split(scenes, seed=seed, protocol="stable")
         sizes: dict[str, int] = {name: len(part) for name, part in scenes_of.items()}
-        deviation = max(abs(sizes[p] / (x * len(scenes)) - 1) for p, x in fractions.items())
+        deviation = max(abs(sizes[p] / (share * len(scenes)) - 1) for p, share in fractions.items())
         if deviation < smallest and all(any(map(_is_informative, x)) for x in scenes_of.values()):
             smallest = deviation
             best = seed, sizes, len({scene.group for scene in scenes_of["test"]})

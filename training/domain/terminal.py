@@ -43,7 +43,7 @@ def fail(error: Exception) -> NoReturn:
     further: list[str] = []
     if isinstance(error, InvalidLinesError):
         reason = f"{error.path.name} has {error.count} errors; nothing was written"
-        further = [f"  {error.path.name}, {one.where}: {one.problem}" for one in error.errors]
+        further = [f"  {error.path.name}, {line.where}: {line.problem}" for line in error.errors]
         more = error.count - len(error.errors)
         further += [f"  and {more} more"] if more else []
     console.print(f"[red]error:[/red] {escape(reason)}", soft_wrap=True)

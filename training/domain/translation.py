@@ -97,6 +97,7 @@ class Translation:
 
     def _relations(self, score: RelationScore) -> RelationScore:
         def score_scene_classes(batch: Batch) -> Tensor:
+            """Score the relations of each scene alone: classes of a scene can map to one class."""
             scores = torch.full(batch.holds.shape, self.unknown)
             for row in range(len(batch)):
                 self._score_row(score, batch, row, scores[row])

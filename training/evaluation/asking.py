@@ -181,7 +181,7 @@ def score_rooms(
     log_p = np.zeros((len(v), artifact.spec.C))
     for row, scene in zip(log_p, _scenes(v), strict=True):
         posterior = Posterior(artifact, replace(scene, profile=index))
-        sharpness = artifact.calibration.rooms.of(posterior.listed)
+        sharpness = artifact.calibration.rooms.of(posterior.listed)  # exponent of p
         row[:] = log_softmax(sharpness * posterior.room_log_p())
     return torch.from_numpy(log_p)
 

@@ -67,15 +67,17 @@ def training_lists(train: SceneTensors, structure: Structure) -> Iterator[tuple[
     A set has all scenes, or only those with complete object lists. A class that a data source
     cannot show is unlabelled, or it is absent.
     """
-    able = train.annotated_classes[train.source] & ~structure
+    shown = train.annotated_classes[train.source] & ~structure
     v, weight = train.v * ~structure, train.weight
-    for absent, labelled in (("", able | (v > 0)), (", unlisted absent", ~structure.expand_as(v))):
-        for name, mask in (("all", torch.ones_like(train.complete)), ("complete", train.complete)):
+    every = torch.ones_like(train.complete)
+    for suffix, labelled in (("", shown | (v > 0)), (", unlisted absent", ~structure.expand_as(v))):
+        for name, mask in (("all", every), ("complete", train.complete)):
+            # Leave out a set that equals an earlier one.
             is_new = name == "all" or not mask.all()
-            if mask.any() and is_new and not (absent and able[mask].all(0)[~structure].all()):
-                share = weight[mask] / weight[mask].mean()
+            if mask.any() and is_new and not (suffix and shown[mask].all(0)[~structure].all()):
+                relative_weight = weight[mask] / weight[mask].mean()
                 index = mask.nonzero().squeeze(1)
-                yield name + absent, Lists(v[mask], labelled[mask], share, index)
+                yield name + suffix, Lists(v[mask], labelled[mask], relative_weight, index)
 
 
 def frequency(
@@ -112,10 +114,10 @@ def fit_ease(
     -P[j,i] / P[i,i]. `weight` weighs the squared errors of each scene.
     """
     w = torch.ones(len(v)) if weight is None else weight
-    x, w = v.double(), w.double()
-    mean = w @ x / w.sum()
-    centred = x - mean
-    gram = (centred * w.unsqueeze(1)).T @ centred
+    presence, w = v.double(), w.double()
+    mean = w @ presence / w.sum()
+    centred = presence - mean
+    gram = (centred * w.unsqueeze(1)).T @ centred  # X'X
     gram.diagonal().add_(l2)
     precision = torch.linalg.inv(gram)
     weights = (-precision / precision.diagonal()).fill_diagonal_(0.0)
@@ -166,9 +168,9 @@ def count_triples(scenes: SceneTensors, structure: Structure) -> TripleCounts:
     for evidence in related:
         holds[np.ix_(np.arange(A), evidence.classes, evidence.classes)] += evidence.holds
         together[np.ix_(evidence.classes, evidence.classes)] += 1.0
-    skip = structure.numpy()
-    pair = ~(skip[:, None] | skip | np.eye(V, dtype=np.bool_))
-    return TripleCounts(torch.from_numpy(holds * pair), torch.from_numpy(together * pair))
+    is_structure = structure.numpy()
+    counted = ~(is_structure[:, None] | is_structure | np.eye(V, dtype=np.bool_))
+    return TripleCounts(torch.from_numpy(holds * counted), torch.from_numpy(together * counted))
 
 
 def table_score(log_odds: Float[Tensor, "A V V"], multiplicity: float = 0.0) -> RelationScore:

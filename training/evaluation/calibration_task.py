@@ -179,7 +179,7 @@ def collect_missing(
     """
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
     parts = draw_parts(scenes, structure, size, (seed,))
-    able = scenes.annotated_classes[scenes.source[parts.scene]].numpy()
+    can_show = scenes.annotated_classes[scenes.source[parts.scene]].numpy()
     items: list[tuple[int, float, bool]] = []
     for row, (k, v) in enumerate(zip(parts.scene.tolist(), parts.v, strict=True)):
         listed, hidden = v.nonzero().squeeze(1).tolist(), int(parts.hidden[row].sum())
@@ -188,7 +188,7 @@ def collect_missing(
         answer = missing(artifact, of_classes(listed), coverage=coverage, details=False)
         for entry in answer["missing"]:
             index = artifact.vocabulary.index(entry["label"])
-            if able[row, index]:
+            if can_show[row, index]:
                 items.append((k, entry["probability"], bool(parts.hidden[row, index])))
     return scored(items, len(scenes)), parts.skipped
 

@@ -112,8 +112,8 @@ def held_out_scenes(evidence: Evidence) -> Drawn:
     if not given.any():
         return Drawn(scenes.v, contradictions)
     rng = np.random.default_rng(evidence.seed)
-    fits = given.float() @ (scenes.v == 0).float().T == 0
-    index = torch.tensor([int(rng.choice(row.nonzero().squeeze(1).numpy())) for row in fits])
+    has_given = given.float() @ (scenes.v == 0).float().T == 0  # scenes with all given classes
+    index = torch.tensor([int(rng.choice(row.nonzero().squeeze(1).numpy())) for row in has_given])
     return Drawn(scenes.v[index], contradictions[index])
 
 
@@ -168,9 +168,10 @@ def discrepancy(
     xy = kernel(drawn, held_out).mean(0)
     n = len(xx)
     mean_xx = float((xx.sum() - np.trace(xx)) / (n * (n - 1)))
-    np.fill_diagonal(yy, 0.0)
+    np.fill_diagonal(yy, 0.0)  # pairs of a scene with itself
 
     def squared_mmd(weight: Float[NDArray, " scenes"]) -> float:
+        """Return MMD² with these weights of the held-out scenes."""
         pairs_weight = weight.sum() ** 2 - (weight**2).sum()
         if not pairs_weight > 0:
             return float("nan")
@@ -207,6 +208,7 @@ def pair_correlation(
     def covariances(
         v: Float[NDArray, "scenes common"], weight: Float[NDArray, " scenes"]
     ) -> Float[NDArray, " pairs"]:
+        """Return the weighted covariance of the presence of each pair of common classes."""
         total = weight.sum()
         mean = weight @ v / total
         return ((v.T * weight) @ v / total - np.outer(mean, mean))[pairs]
@@ -243,18 +245,19 @@ def generation_metrics(
     emphasis: Float[Tensor, " scenes"] | None = None,
 ) -> dict[str, Metric]:
     """Compute all metrics of T4 over the classes in the mask; `emphasis` weighs held-out scenes."""
-    x, y, training = drawn.v[:, mask], held_out[:, mask], train[:, mask]
-    drawn_v, held_out_v = x.double().numpy(), y.double().numpy()
-    base = np.ones(len(y)) if emphasis is None else emphasis.double().numpy()
+    generated, reference, training = drawn.v[:, mask], held_out[:, mask], train[:, mask]
+    drawn_v, held_out_v = generated.double().numpy(), reference.double().numpy()
+    base = np.ones(len(reference)) if emphasis is None else emphasis.double().numpy()
+    count = len(generated)
 
     def resampled(statistic: Statistic) -> Resampled:
-        return Resampled.of(lambda weight: statistic(weight * base), groups, len(x), _RESAMPLES)
+        return Resampled.of(lambda weight: statistic(weight * base), groups, count, _RESAMPLES)
 
     metrics: dict[str, Metric] = {
-        "MMD²": resampled(discrepancy(y, x, bandwidth)),
+        "MMD²": resampled(discrepancy(reference, generated, bandwidth)),
         "marginal error": resampled(marginal_error(held_out_v, drawn_v)),
         "classes per scene": Ratio.of_scenes(drawn_v.sum(1)),
-        "copies of training scenes": Ratio.of_scenes(copies(x, training)),
+        "copies of training scenes": Ratio.of_scenes(copies(generated, training)),
     }
     pairs = resampled(pair_correlation(held_out_v, drawn_v))
     if np.isfinite(pairs.value):
@@ -325,8 +328,9 @@ def generated_rooms_task(artifact: SceneModel, setting: Setting) -> Outcome | No
         if mask.sum() >= _FEWEST:
             metrics[name] = Ratio.of_scenes(refused * mask, mask)
     whole = np.array([source_of(scene.source).whole_rooms for scene in scenes.scenes], np.bool_)
-    sizes = present.sum(1).double().numpy()
-    for name, mask in {FREE: whole, **{n: m & whole for n, m in of_type.items()}}.items():
+    sizes = present.sum(1).double().numpy()  # numbers of classes
+    whole_of_type = {name: mask & whole for name, mask in of_type.items()}
+    for name, mask in {FREE: whole, **whole_of_type}.items():
         if mask.sum() >= _FEWEST:
             drawn = _drawn_size(artifact, types.get(name), things, setting.seed)
             change, groups = _size_change(drawn, sizes[mask]), scenes.group_ids[mask]

@@ -248,6 +248,7 @@ class Scored(Metric):
 
     @classmethod
     def join(cls, parts: Sequence[Self]) -> Scored:
+        """Return the statistic over the items of all parts. Equal groups become one group."""
         groups = np.concatenate([part.groups for part in parts])
         starts = np.cumsum([0, *(len(part.groups) for part in parts)])[:-1]
         unit = np.concatenate([p.unit + start for p, start in zip(parts, starts, strict=True)])
@@ -266,8 +267,8 @@ class Scored(Metric):
 
     def _weights(self, weight: Float[NDArray, " G"]) -> Levels:
         scores, level = self._levels
-        each = weight[self.unit]
-        counts = (np.bincount(level, w, len(scores)) for w in (each, each * self.truth))
+        of_item = weight[self.unit]
+        counts = (np.bincount(level, w, len(scores)) for w in (of_item, of_item * self.truth))
         return np.stack([scores, *counts])
 
     def at(self, weight: Float[NDArray, " G"]) -> float:

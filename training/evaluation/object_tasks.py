@@ -125,27 +125,27 @@ def removed_places(
     scenes: SceneTensors, structure: Structure, seed: int = 0
 ) -> tuple[Int[Tensor, " N"], Int[Tensor, " N"], Places]:
     """Return the indices of the scenes, the removed classes, and their places."""
-    removals: list[tuple[int, int, int, int, bool]] = []
+    removals: list[tuple[int, int, int, int, bool]] = []  # the columns of `table` below
     for k, scene in enumerate(scenes.scenes):
         evidence = scene.evidence
         is_thing = ~structure.numpy()[evidence.classes]
         pair = is_thing[:, None] & is_thing & ~np.eye(len(is_thing), dtype=np.bool_)
         triples = np.argwhere(evidence.holds & pair)
         rng = scene_rng(scene, seed)
-        for x in np.unique(triples[:, 1:]):
-            triples_of_x = triples[(triples[:, 1:] == x).any(1)]
-            a, i, j = triples_of_x[rng.integers(len(triples_of_x))].tolist()
-            anchor = j if i == x else i
-            target, anchor_class = evidence.classes[[x, anchor]].tolist()
-            removals.append((k, target, a, anchor_class, bool(i == x)))
+        for removed in np.unique(triples[:, 1:]):
+            own_triples = triples[(triples[:, 1:] == removed).any(1)]
+            relation, i, j = own_triples[rng.integers(len(own_triples))].tolist()
+            anchor = j if i == removed else i
+            target, anchor_class = evidence.classes[[removed, anchor]].tolist()
+            removals.append((k, target, relation, anchor_class, bool(i == removed)))
     table = torch.tensor(removals, dtype=torch.int64).reshape(-1, 5)
-    row, target, relation, anchor, outgoing = table.unbind(1)
-    v = (scenes.v[row] * ~structure).scatter(1, target.unsqueeze(1), 0.0)
+    row, targets, relations, anchors, outgoing = table.unbind(1)
+    v = (scenes.v[row] * ~structure).scatter(1, targets.unsqueeze(1), 0.0)
     counts = torch.zeros_like(v)
     for own, k in zip(counts, row.tolist(), strict=True):
         evidence = scenes.scenes[k].evidence
         own[torch.from_numpy(evidence.classes)] = torch.tensor(evidence.counts).float()
-    return row, target, Places(v, counts * v, relation, anchor, outgoing.bool())
+    return row, targets, Places(v, counts * v, relations, anchors, outgoing.bool())
 
 
 def leave_one_out_at(
@@ -154,8 +154,9 @@ def leave_one_out_at(
     """Return the rank of every removed class, as of `rank_hidden`, and its relation."""
     row, target, places = removed_places(scenes, structure, seed)
     related = scenes.relatives_of(places.v)
-    kept = ~related.gather(1, target.unsqueeze(1)).squeeze(1)
-    row, target, places, related = row[kept], target[kept], places.rows(kept), related[kept]
+    # The service never proposes a class of one family with a listed class, so it has no rank.
+    mask = ~related.gather(1, target.unsqueeze(1)).squeeze(1)
+    row, target, places, related = row[mask], target[mask], places.rows(mask), related[mask]
     values = ask_rows(lambda *columns: score(Places(*columns)), *vars(places).values(), block=16)
     values = values.masked_fill((places.v > 0) | structure | related, -torch.inf)
     return Ranking.of(row, target, values, len(scenes)), places.relation.numpy()

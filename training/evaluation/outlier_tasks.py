@@ -180,17 +180,17 @@ def draw_intruders(
 
 
 def signatures(train: SceneTensors) -> tuple[Bool[NDArray, "C V"], Float[NDArray, "C V"]]:
-    """Return a mask of signature classes, and p(class | room type): NaN with too few scenes."""
+    """Return a mask of the signature classes of room types, and p(class | room type), else NaN."""
     has_room = (train.room >= 0).numpy()
     v, room = train.v.numpy()[has_room] > 0, train.room.numpy()[has_room]
     share = np.full((int(room.max(initial=-1)) + 1, v.shape[1]), np.nan)
     typical = np.zeros(share.shape, dtype=np.bool_)
-    for r in np.flatnonzero(np.bincount(room) >= _SCENES):
-        share[r] = v[room == r].mean(0)
-        is_frequent = share[r] >= _OFTEN
-        lift = np.divide(share[r], v.mean(0), where=is_frequent, out=np.zeros(v.shape[1]))
+    for room_type in np.flatnonzero(np.bincount(room) >= _SCENES):
+        share[room_type] = v[room == room_type].mean(0)
+        is_frequent = share[room_type] >= _OFTEN
+        lift = np.divide(share[room_type], v.mean(0), where=is_frequent, out=np.zeros(v.shape[1]))
         ranked = np.argsort(-lift, kind="stable")[:SIGNATURE]
-        typical[r, ranked[lift[ranked] >= _LIFT]] = True
+        typical[room_type, ranked[lift[ranked] >= _LIFT]] = True
     return typical, share
 
 
@@ -201,10 +201,10 @@ def by_signature(scenes: SceneTensors, train: SceneTensors) -> Float[Tensor, "sc
     for k, room in enumerate(scenes.room.tolist()):
         if not 0 <= room < len(typical) or np.isnan(share[room]).any():
             continue
-        suitable = typical & absent[k] & (share[room] < _FOREIGN)
+        suitable = typical & absent[k] & (share[room] < _FOREIGN)  # by room type and class
         suitable[room] = False
-        suitable = suitable[suitable.any(1)]
-        if len(suitable):
+        suitable = suitable[suitable.any(1)]  # room types with such a class
+        if len(suitable):  # a uniform room type, and then a uniform class of it
             weights[k] = (suitable / suitable.sum(1, keepdims=True)).mean(0)
     return torch.from_numpy(weights)
 
@@ -299,7 +299,7 @@ def _random_part(encoded: EncodedScene, structure: Bool[NDArray, " V"], rng: Rng
     """Return the instances of two to `LONGEST` random classes, with their relations."""
     classes = encoded.evidence.classes
     order = rng.permutation(classes[~structure[classes]])
-    hidden = order[rng.integers(2, min(LONGEST, max(len(order), 2)) + 1) :]
+    hidden = order[rng.integers(2, min(LONGEST, max(len(order), 2)) + 1) :]  # not in the part
     kept = thing_instances(encoded, structure, hidden)
     index_of = {instance: index for index, instance in enumerate(kept)}
     triples = [

@@ -222,6 +222,7 @@ def _hard_pairs(classes: Int[NDArray, "N 2"], setting: Setting) -> dict[str, Boo
         triples = seen_triples(setting.train.scenes, V)
     related = np.unique(np.sort(triples.numpy()[:, 1:].astype(np.int64), axis=1), axis=0)
     partners = np.bincount(related.ravel(), minlength=V)
-    is_unseen = ~np.isin(classes @ np.array([V, 1]), related @ np.array([V, 1]))
+    key = np.array([V, 1])  # i V + j is the key of the classes i < j
+    is_unseen = ~np.isin(classes @ key, related @ key)
     is_rare = np.any(partners[classes] <= RARE, axis=1)
     return {", unseen pairs": is_unseen, ", rare classes": is_rare}

@@ -173,7 +173,7 @@ def rank_hidden(parts: Parts, structure: Structure, values: Float[Tensor, "N V"]
     values = values.clamp(min=torch.finfo(values.dtype).min)
     values = values.masked_fill((parts.v > 0) | structure | parts.related, -torch.inf)
     row, target = (parts.hidden & ~parts.related).nonzero(as_tuple=True)
-    others = parts.hidden[row].scatter(1, target.unsqueeze(1), False)
+    others = parts.hidden[row].scatter(1, target.unsqueeze(1), False)  # other hidden classes
     competing = values[row].masked_fill(others, -torch.inf)
     return Ranking.of(parts.scene[row], target, competing, parts.scenes)
 

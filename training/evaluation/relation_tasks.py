@@ -129,6 +129,7 @@ def complete_scenes(
     """
 
     def ask(batch: Batch, index: list[int]) -> tuple[Tensor, Tensor]:
+        """Observe half of the triples; score the others without mirror images of observed ones."""
         mask = scorable(batch, structure)
         truth = (batch.holds > 0) & mask
         observed = torch.zeros_like(truth)
@@ -191,10 +192,10 @@ def draw_false_triple(
     A, n, _ = holds.shape
     relation, subject, object_ = true_triples[rng.integers(len(true_triples))].tolist()
     for _ in range(_TRIES):
-        part, new_class = rng.random(), int(rng.integers(n))
-        if part < 0.5:
+        change, new_class = rng.random(), int(rng.integers(n))
+        if change < 0.5:
             a, i, j = int(rng.integers(A)), subject, object_
-        elif part < 0.75:
+        elif change < 0.75:
             a, i, j = relation, subject, new_class
         else:
             a, i, j = relation, new_class, object_
@@ -307,6 +308,7 @@ def evidence_cases(
         things = classes[~structure[classes]]
         if len(things) < 3 or (kind == "poses" and encoded.instance_positions is None):
             continue
+        # A relation needs two classes, so the evidence is about at least two of them.
         half = scene_rng(encoded, seed).permutation(things)[: max(2, len(things) // 2)]
         in_half, is_thing = np.isin(instances, half), ~structure[instances]
         between = in_half[:, None] & in_half
@@ -331,10 +333,11 @@ def relations_evidence_task(artifact: SceneModel, setting: Setting) -> Outcome |
     skipped: list[int] = []
 
     def ask(case: Case) -> Float[NDArray, " 2"]:
+        """Return the expected hits without and with the evidence of a case."""
         count, truth = int(case.truth.sum()), case.truth[case.queried]
         bare = replace(case.scene, relations=None)
-        p = (relation_probabilities(artifact, scene) for scene in (bare, case.scene))
-        return np.array([expected_hits(x[case.queried], truth, count) for x in p])
+        answers = (relation_probabilities(artifact, scene) for scene in (bare, case.scene))
+        return np.array([expected_hits(p[case.queried], truth, count) for p in answers])
 
     for kind in OF_RELATIONS:
         cases = list(evidence_cases(scenes, structure, kind, setting.seed))

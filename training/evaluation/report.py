@@ -122,7 +122,7 @@ def evaluate(
         name for name, task in EVERY_TASK.items() if task.card and (tasks is None or name in tasks)
     ]
     of_source = [task for task in selected if task not in WHOLE_SET]
-    once = [task for task in selected if task in ONCE]
+    once = [task for task in selected if task in ONCE]  # about facts, not about the scenes
     whole = [task for task in selected if task in WHOLE_SET and task not in ONCE]
     every = Setting(scenes, structure, train, limit=limit)
     by_name = dict(every.by_source())

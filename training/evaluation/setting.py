@@ -194,10 +194,10 @@ def suspicion_of(
         row, listed = (v > 0).nonzero(as_tuple=True)
         values = torch.full(v.shape, -torch.inf)
         if len(row):
-            others = v[row].scatter(1, listed.unsqueeze(1), 0.0)
-            z = score(others).gather(1, listed.unsqueeze(1)).squeeze(1).to(values.dtype)
+            others = v[row].scatter(1, listed.unsqueeze(1), 0.0)  # one list for each listed class
+            own = score(others).gather(1, listed.unsqueeze(1)).squeeze(1).to(values.dtype)
             prior = 0.0 if log_popularity is None else weight * log_popularity[listed]
-            values[row, listed] = prior - z
+            values[row, listed] = prior - own
         return values
 
     return suspicion

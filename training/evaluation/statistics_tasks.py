@@ -109,11 +109,12 @@ def counts_task(artifact: SceneModel, setting: Setting) -> Outcome | None:
 
     row = np.searchsorted(artifact.counts.classes, index)
     of_class = mean(np.abs(class_mean(artifact.counts, row, listed_number) - number))
-    times, total = np.zeros((2, len(artifact.vocabulary)))
+    # The setting has one data source, so the mean of its training scenes is that of the source.
+    class_scenes, instances = np.zeros((2, len(artifact.vocabulary)))
     for evidence in (encoded.evidence for encoded in train.scenes):
-        times[evidence.classes] += 1
-        total[evidence.classes] += np.minimum(evidence.counts, MOST)
-    source_mean = np.maximum((total / np.maximum(times, 1))[index], listed)
+        class_scenes[evidence.classes] += 1
+        instances[evidence.classes] += np.minimum(evidence.counts, MOST)
+    source_mean = np.maximum((instances / np.maximum(class_scenes, 1))[index], listed)
     error = mean(np.abs(expected - number))
     metrics: dict[str, Metric] = {
         "error of the expected count": error,

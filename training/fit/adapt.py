@@ -100,7 +100,7 @@ def part_loss(
 
 
 class _Fit:
-    """The fit of one home."""
+    """The fit of one home: `machine` starts as a copy of `parent`, and each step changes it."""
 
     def __init__(
         self, parent: Weights, scenes: HomeScenes, trained_on: TrainedOn, seed: int
@@ -110,54 +110,58 @@ class _Fit:
         self._generator = torch.Generator().manual_seed(seed)
         self._recorded = (scenes.v > 0).any(0)
         new = self._recorded & ~trained_on.classes
+        # The stored samples do not show new classes, so these are unobserved there.
         samples = torch.from_numpy(parent.chain_samples)
         rooms = torch.from_numpy(parent["fantasy_rooms"]).long()
         self._samples = HomeScenes(samples, (~new).expand_as(samples), rooms)
         self._samples = self._samples.rows(samples.sum(1) >= 2)
-        self._kept = 1 / (1 + self._expected())
-        self._changes = self._changing(new, trained_on.rooms)
-        self._start = {weight: weight.clone() for weight in self._changes}
+        self._unseen_factor = 1 / (1 + self._expected())
+        self._precisions = self._changing(new, trained_on.rooms)
+        self._start = {weight: weight.clone() for weight in self._precisions}
+        # One added scene without the class keeps the share, and so the bias, finite.
         share = scenes.v.sum(0) / (scenes.observed.sum(0) + 1)
         self.machine.b[new] = self.machine.b.maximum(share.logit())[new]
-        for weight in self._changes:
+        for weight in self._precisions:
             weight.requires_grad_(True)
-        self._optimiser = torch.optim.Adam(self._changes, lr=_RATE)
+        self._optimiser = torch.optim.Adam(self._precisions, lr=_RATE)
 
     def _expected(self) -> Float[Tensor, "V"]:
         """Return E_k: in how many recorded scenes the parent expects each class."""
-        several = self.scenes.rows(torch.arange(len(self.scenes)).repeat(_REPEATS))
-        parts = random_parts(several.v, _LEAVE_ONE_OUT, self._generator)
-        p = self.parent.object_log_odds(parts.listed, room=several.room, share=parts.share)
-        return (several.observed * p.sigmoid()).sum(0) / _REPEATS
+        repeated = self.scenes.rows(torch.arange(len(self.scenes)).repeat(_REPEATS))
+        parts = random_parts(repeated.v, _LEAVE_ONE_OUT, self._generator)
+        log_odds = self.parent.object_log_odds(parts.listed, room=repeated.room, share=parts.share)
+        return (repeated.observed * log_odds.sigmoid()).sum(0) / _REPEATS
 
-    def _changing(self, new: Bool[Tensor, "V"], C: int) -> dict[Tensor, Tensor]:
-        """Return the weights that change, with the precisions of their entries; 0 is constant."""
+    def _changing(self, new: Bool[Tensor, "V"], old_rooms: int) -> dict[Tensor, Tensor]:
+        """Return the weights that change, with the prior precision of each entry; 0 is constant."""
+        # Constant are the rows of unrecorded classes and of the first `old_rooms` room types.
         machine = self.machine
         bias = torch.where(new, _NEW_BIAS, _BIAS)
         rows = torch.where(self._recorded, _WEIGHT, 0.0).unsqueeze(1).expand_as(machine.W)
-        changes: dict[Tensor, Tensor] = {machine.b: bias, machine.W: rows}
-        if machine.spec.C > C:
-            named = {"e": _NEW_BIAS, "Q": _WEIGHT, "Y": _WEIGHT}
+        precisions: dict[Tensor, Tensor] = {machine.b: bias, machine.W: rows}
+        if old_rooms < machine.spec.C:
+            of_new_rooms = {"e": _NEW_BIAS, "Q": _WEIGHT, "Y": _WEIGHT}
             for name in ("e", "Q", "Y") if machine.spec.coupled else ("e", "Q"):
                 weight = machine.get_parameter(name)
-                table = torch.zeros_like(weight)
-                table[C:] = named[name]
-                changes[weight] = table
-        return changes
+                precision = torch.zeros_like(weight)
+                precision[old_rooms:] = of_new_rooms[name]
+                precisions[weight] = precision
+        return precisions
 
     def step(self) -> None:
+        """Update the weights by one step of Adam. Constant entries have no gradient."""
         loss = len(self.scenes) * self._batch_loss() + self._prior()
         self._optimiser.zero_grad()
         loss.backward()
-        for weight, precision in self._changes.items():
+        for weight, precision in self._precisions.items():
             if weight.grad is not None:
                 weight.grad[precision == 0] = 0
         self._optimiser.step()
 
     def _batch_loss(self) -> Tensor:
-        """Return the loss of parts of recorded scenes, followed by parts of stored samples."""
-        drawn = self._draw(self.scenes, _BATCH), self._draw(self._samples, _DISTILLED)
-        columns = zip(*(part.columns for part in drawn), strict=True)
+        """Return the loss of `_BATCH` parts of recorded scenes, then `_DISTILLED` of samples."""
+        blocks = self._draw(self.scenes, _BATCH), self._draw(self._samples, _DISTILLED)
+        columns = zip(*(block.columns for block in blocks), strict=True)
         scenes = HomeScenes(*map(torch.cat, columns))
         of_home = (torch.arange(len(scenes)) < _BATCH).unsqueeze(1)
         scale = torch.where(of_home.squeeze(1), 1 / _BATCH, _DISTILLATION / _DISTILLED)
@@ -168,17 +172,18 @@ class _Fit:
             machine.object_log_odds(parts.listed, room=room, share=parts.share)
             for machine in (self.parent, self.machine)
         )
-        p, present = of_parent.sigmoid(), scenes.v - parts.listed
-        target = torch.where(of_home, torch.where(self._recorded, present, self._kept * p), p)
+        parent_p, hidden = of_parent.sigmoid(), scenes.v - parts.listed
+        home_target = torch.where(self._recorded, hidden, self._unseen_factor * parent_p)
+        target = torch.where(of_home, home_target, parent_p)
         loss = (scale * part_loss(log_odds, target, scenes, parts)).sum()
         is_hidden = (room < 0) & (scenes.room >= 0)
         if bool(is_hidden.any()):
-            p, log_p = (
+            parent_log_p, log_p = (
                 machine.room_log_p(parts.listed[is_hidden])
                 for machine in (self.parent, self.machine)
             )
             true = one_hot(scenes.room[is_hidden], self.machine.spec.C)
-            target = torch.where(of_home[is_hidden], true, p.exp())
+            target = torch.where(of_home[is_hidden], true, parent_log_p.exp())
             loss = loss - (scale[is_hidden].unsqueeze(1) * target * log_p).sum()
         return loss
 
@@ -187,7 +192,7 @@ class _Fit:
 
     def _prior(self) -> Tensor:
         total = torch.zeros(())
-        for weight, precision in self._changes.items():
+        for weight, precision in self._precisions.items():
             total = total + (precision * (weight - self._start[weight]) ** 2).sum()
         return total
 
@@ -222,6 +227,7 @@ def extended(
 
 
 def _weights(weights: Weights, V: int, C: int) -> Weights:
+    """Return the weights for V classes and C room types: new biases are low, most others 0."""
     old, larger = weights.spec, weights.enlarged(V, C if weights.spec.C else 0)
     arrays = larger.arrays
     arrays["b"][old.V :] = np.quantile(weights["b"], _RARE)
@@ -248,6 +254,7 @@ def _calibration(calibration: Calibration, classes: int, C: int, rooms: int) -> 
 
 
 def _offsets(offsets: Offsets, old: int, new: int) -> Offsets:
+    """Return the offsets for `new` instead of `old` classes. Effects of new classes are 0."""
     A, more = len(offsets.relation), ((0, 0), (0, new - old), (0, 0))
     return replace(
         offsets,
@@ -258,7 +265,7 @@ def _offsets(offsets: Offsets, old: int, new: int) -> Offsets:
 
 
 def _triple_keys(keys: NDArray[Any], old: int, new: int, A: int) -> NDArray[Any]:
-    """Return the keys (a V + i) V + j for another number of classes."""
+    """Return keys (a V + i) V + j of relation a and classes i and j, for V = new instead of old."""
     a, i, j = np.unravel_index(keys.astype(np.int64), (A, old, old))
     rekeyed: NDArray[Any] = ((a * new + i) * new + j).astype(keys.dtype)
     return rekeyed
@@ -276,6 +283,8 @@ def _counts(counts: Counts, C: int, rooms: int, classes: int) -> Counts:
 
 
 def _places(places: Places, old: int, new: int) -> Places:
+    """Return the places for `new` instead of `old` classes. New ones get the lowest frequency."""
+
     def averaged(table: NDArray[Any]) -> NDArray[Any]:
         mean = table.mean(0, keepdims=True).repeat(new - old, 0)
         return np.concatenate([table, mean.astype(table.dtype)])

@@ -105,14 +105,16 @@ def with_lower_lateral(
     artifact: SceneModel, slopes: tuple[CountSlope, ...], scenes: SceneTensors
 ) -> tuple[CountSlope, ...]:
     """Lower the log-odds of left and front until the likeliest relations are the listed ones."""
-    table = np.array([(s.intercept, s.slope, s.log_count) for s in slopes])[:, :, None, None]
+    entries = np.array([(s.intercept, s.slope, s.log_count) for s in slopes])
+    intercept, slope, log_count = entries.T[:, :, None, None]  # of each relation, (A, 1, 1)
 
     def score(question: ScenePairs) -> NDArray[np.float64]:
+        """Return the calibrated log-odds of all relations of the pairs, in both directions."""
         scene = question.scene
         posterior = _posterior(artifact, scene, range(len(scene.instance_classes)))
         log_odds = posterior.relation_log_odds().astype(np.float64)
         logs = np.log(scene.evidence.counts)
-        logits = table[:, 0] + table[:, 1] * log_odds + table[:, 2] * (logs[:, None] + logs)
+        logits = intercept + slope * log_odds + log_count * (logs[:, None] + logs)
         return both_ways(logits, question.pairs)
 
     # Of two stacked objects, an annotator lists only the stacked relation.
@@ -170,7 +172,10 @@ class _Examples(Table):
 def _examples_of_pairs(
     artifact: SceneModel, scenes: Sequence[EncodedScene], rng: Rng | None = None
 ) -> _Examples:
-    """Return the examples of all pairs of a scene; with `rng`, of half, given the other half."""
+    """Return the examples of all pairs of a scene; with `rng`, of half, given the other half.
+
+    A pair is an ordered pair of instances. Structure takes no part.
+    """
     blocks = []
     structure = artifact.vocabulary.structure
     sources = sorted({encoded.source for encoded in scenes})
@@ -181,9 +186,10 @@ def _examples_of_pairs(
             pairs, observed = observed_pairs(encoded, structure, rng)
         if not n or (rng is not None and not observed):
             continue
+        # The model answers for classes: `index` is the row of the class of each instance.
         index = np.searchsorted(encoded.evidence.classes, encoded.instance_classes)
-        values = _posterior(artifact, encoded, range(n), observed).relation_log_odds()
-        log_odds = values[:, index[:, None], index]
+        of_classes = _posterior(artifact, encoded, range(n), observed).relation_log_odds()
+        log_odds = of_classes[:, index[:, None], index]
         is_thing = ~structure[encoded.instance_classes]
         pairs = pairs & is_thing[:, None] & is_thing & ~np.eye(n, dtype=np.bool_)
         annotated = annotated_relations(encoded)
@@ -215,7 +221,7 @@ def fit_placements(
     blocks = []
     for number in range(_PLACEMENT_CASES * len(scenes)):
         encoded = scenes[number % len(scenes)]
-        if number % 2:
+        if number % 2:  # every other case
             encoded = _part_of(encoded, structure, rng)
         removal = removed_class(encoded, structure, rng)
         if removal is None:
@@ -229,6 +235,7 @@ def fit_placements(
         anchor_index = np.array(kept)[present.first[anchors]]
         removed_index = np.full_like(anchor_index, instance)
         holds, annotated = encoded.instance_holds, annotated_relations(encoded)
+        # Two tables of log-odds: the removed object is the subject, or the object of the relation.
         directions = (removed_index, anchor_index), (anchor_index, removed_index)
         for values, (subject, object_) in zip(tables, directions, strict=True):
             truth = np.where(annotated[:, subject, object_], holds[:, subject, object_], _UNKNOWN)
@@ -267,6 +274,7 @@ def _fit_listed(examples: _Examples, listed: int) -> tuple[CountSlope, ...]:
 
 def _source_weights(examples: _Examples, is_listed: Bool[NDArray, "N"]) -> Float[NDArray, "N"]:
     """Return weights that give each source the same total of listed examples of a relation."""
+    # One number for each pair of relation and source.
     key = examples.relation * (examples.source.max(initial=0) + 1) + examples.source
     counts = np.bincount(key[is_listed], minlength=int(key.max(initial=-1)) + 1)
     return (1 / np.maximum(counts, 1.0))[key]
@@ -276,9 +284,10 @@ def _is_listed(
     examples: _Examples, slopes: tuple[CountSlope, ...], listed: int
 ) -> Bool[NDArray, "N"]:
     """Mark the `listed` examples of each scene with the highest calibrated log-odds."""
-    table = np.array([(s.slope, s.log_count, s.intercept) for s in slopes])
-    slope, log_count, intercept = table[examples.relation].T
+    entries = np.array([(s.slope, s.log_count, s.intercept) for s in slopes])
+    slope, log_count, intercept = entries[examples.relation].T
     logits = examples.log_odds * slope + examples.log_count * log_count + intercept
+    # Sort by scene, then by falling log-odds. The rank is the distance from the scene's first one.
     order = np.lexsort((-logits, examples.scene))
     scene = examples.scene[order]
     rank = np.arange(len(order)) - np.searchsorted(scene, scene)

@@ -62,13 +62,15 @@ def place_terms(artifact: SceneModel, question: PlaceQuestion) -> PlaceTerms:
     """Return the terms of the candidate classes at a place."""
     scene, place, is_there, usable = question
     posterior, classes = Posterior(artifact, scene), np.flatnonzero(usable)
-    z = posterior.absent_log_odds(classes, artifact.calibration.coverage).astype(np.float64)
+    log_odds = posterior.absent_log_odds(classes, artifact.calibration.coverage).astype(np.float64)
     counts = np.zeros(len(classes))
     if artifact.places is not None:
         anchor = int(posterior.present.classes[posterior.present.row[place.anchor]])
         counts = artifact.places.log_ratio(place.relation, anchor, outgoing=place.outgoing)[classes]
     return PlaceTerms(
-        calibrated_missing(artifact.calibration, z, posterior.listed, None).astype(np.float64),
+        calibrated_missing(artifact.calibration, log_odds, posterior.listed, None).astype(
+            np.float64
+        ),
         place_log_p(posterior, classes, place).astype(np.float64),
         counts,
         is_there[classes],
@@ -87,17 +89,19 @@ def fit_place(sources: Sequence[Sequence[PlaceTerms]]) -> PlaceFit:
     present, relation, counts, is_there = map(np.concatenate, zip(*columns, strict=True))
     if is_there.sum() < _LEAST_TRUE:
         return PlaceFit()
+    # The questions of a source have the total weight 1.
     weight = np.concatenate(
         [np.full(sum(len(t.is_there) for t in terms), 1 / len(terms)) for terms in sources]
     )
-    log_present = -np.logaddexp(0.0, -present)
+    log_present = -np.logaddexp(0.0, -present)  # log σ of the log-odds
 
-    def loss(weights: NDArray[np.float64]) -> float:
-        logits = weights[0] + weights[1] * relation + weights[2] * counts
-        log_p = log_present - np.logaddexp(0.0, -logits)
-        log_not = np.log(-np.expm1(np.minimum(log_p, -1e-12)))
+    def loss(parameters: NDArray[np.float64]) -> float:
+        """Return the penalised negative log-likelihood of (a, b, c)."""
+        a, b, c = parameters
+        log_p = log_present - np.logaddexp(0.0, -(a + b * relation + c * counts))
+        log_not = np.log(-np.expm1(np.minimum(log_p, -1e-12)))  # log(1 - p), also for p near 1
         likelihood = weight @ np.where(is_there, log_p, log_not)
-        return float(_PENALTY * weights[0] ** 2 - likelihood / len(sources))
+        return float(_PENALTY * a**2 - likelihood / len(sources))
 
     limits = [(None, None), (0, 1.5), (0, 1.5)]
     best = minimize(loss, [0.0, 0.5, 0.3], bounds=limits).x.tolist()

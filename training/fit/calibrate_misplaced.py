@@ -89,6 +89,12 @@ def fit_misplaced(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: in
 
 
 def _cases(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int) -> _Cases | None:
+    """Ask about each scene several times, and return the usable entries; None without any scene.
+
+    An entry is a judged relation, or a judged stand (floor or wall) of an object.
+    """
+    # Columns `encoded`, `source`, `untouched`, `complete` and `weight` of each question, and
+    # columns `kind`, `terms` and `wrong` of its entries.
     of_scene: list[tuple[int, str, bool, bool, float]] = []
     of_entries: list[tuple[NDArray, ...]] = []
     for number, encoded in enumerate(scenes):
@@ -100,6 +106,7 @@ def _cases(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int) -> _
             entries = entries_of(artifact, Posterior(artifact, bare), bare)
             is_wrong, usable = _truth(entries, wrong)
             usable &= np.isin(entries.kind, shown)
+            # Leave out listed relations above of scenes with boxes, and those with an explanation.
             listed_of_boxes = not bare.has_boxes and encoded.instance_positions is not None
             explained = listed_of_boxes | (entries.terms[:, 0] >= EXPLAINED)
             usable &= (entries.kind != OVER) | ~explained
@@ -122,7 +129,7 @@ def _cases(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int) -> _
 def _questions(
     artifact: SceneModel, encoded: EncodedScene, seed: int
 ) -> Iterator[tuple[Scene, Triple | int | None]]:
-    """Yield scenes, and the wrong triple, moved object or None."""
+    """Yield scenes with their wrong entry: a triple, the index of the moved object, or None."""
     structure, places = artifact.vocabulary.structure, artifact.places
     classes, rng = encoded.instance_classes.tolist(), scene_rng(encoded, seed)
     triples = draw_true_relations(encoded, structure, rng)
@@ -185,7 +192,7 @@ def _fit_kind(cases: _Cases, budget: float) -> Judgement | None:
     complete = untouched.rows(untouched.complete)
     if len(np.unique(complete.encoded)) >= LEAST_SCENES:
         untouched = complete
-    used = cases.terms.std(0) > 0
+    used = cases.terms.std(0) > 0  # mask of the terms in the regression
     weights, intercept = np.zeros(TERMS), 0.0
     while used.any():
         *fitted, intercept = logistic(cases.terms[:, used], cases.wrong, cases.weight, C=RIDGE)
@@ -208,34 +215,38 @@ def _alarm_lines(judgement: Judgement, untouched: _Cases, budget: float) -> Alar
     log_odds = wrong_log_odds(judgement, untouched.terms)
     rng = np.random.default_rng(0)
     points: dict[str, list[tuple[float, float]]] = {name: [] for name in ALARMS}
+    # Entries of a scene are neighbours: split the log-odds where the scene changes.
     starts = np.flatnonzero(np.diff(untouched.scene, prepend=-1))
     lists = np.split(log_odds, starts[1:])
     sources = untouched.source[starts]
     for n in _LENGTHS:
-        kept = [k for k, values in enumerate(lists) if len(values) >= n]
-        if len(kept) < LEAST_SCENES:
+        long_enough = [k for k, values in enumerate(lists) if len(values) >= n]
+        if len(long_enough) < LEAST_SCENES:
             break
-        highest = np.array([rng.permutation(lists[k])[:n].max() for k in kept])
+        highest = np.array([rng.permutation(lists[k])[:n].max() for k in long_enough])
         for name, share in ALARMS.items():
-            limit = hardest_quantile(highest, sources[kept], 1 - budget * share)
+            limit = hardest_quantile(highest, sources[long_enough], 1 - budget * share)
             points[name].append((float(np.log(n)), limit))
     return AlarmLines(**{name: _line(points[name], LEAST_ALARM[name]) for name in ALARMS})
 
 
 def _line(points: Sequence[tuple[float, float]], least: float) -> AlarmLine:
-    """Return a line, at least at `least`, that rises with the number n by at most log n."""
-    x, y = np.array(points).T
-    slope = min(max(float(np.polyfit(x, y, 1)[0]), 0.0), 1.0) if len(x) > 1 else 0.0
-    intercept = float(np.mean(y - slope * x))
+    """Fit a line through points (log n, limit of the log-odds), with a slope from 0 to 1.
+
+    Its intercept is at least the log-odds of the probability `least`.
+    """
+    log_n, limits = np.array(points).T
+    slope = min(max(float(np.polyfit(log_n, limits, 1)[0]), 0.0), 1.0) if len(log_n) > 1 else 0.0
+    intercept = float(np.mean(limits - slope * log_n))
     return AlarmLine(intercept=max(intercept, float(logit(least))), log_count=slope)
 
 
 def hardest_quantile(values: Float[NDArray, "N"], sources: NDArray[np.str_], share: float) -> float:
-    """Return the highest quantile over the large sources, since a robot sees one source."""
+    """Return the highest quantile over the sources; a robot sees one. Small ones count as one."""
     names, sizes = np.unique(sources, return_counts=True)
     small = np.isin(sources, names[sizes < _SOURCE_SCENES])
-    parts = [sources == name for name in names[sizes >= _SOURCE_SCENES]]
-    parts += [small] if small.any() else []
-    highest = max(float(np.quantile(values[part], share)) for part in parts)
-    # A value equal to the quantile is below it.
+    masks = [sources == name for name in names[sizes >= _SOURCE_SCENES]]
+    masks += [small] if small.any() else []
+    highest = max(float(np.quantile(values[mask], share)) for mask in masks)
+    # The next larger number, so that a value equal to the quantile is below the limit.
     return float(np.nextafter(highest, np.inf))

@@ -95,7 +95,7 @@ def calibrate_objects(
 
 
 def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
-    """Return complete scenes, else all. The weight of a scene is the probability to keep it."""
+    """Keep complete scenes (without any, all), each with its weight as the probability."""
     rng = np.random.default_rng(seed)
     complete = scenes.complete.numpy()
     complete = complete if complete.any() else ~complete
@@ -131,11 +131,11 @@ def fit_missing(
         return {}
     coverages = COVERAGES if chosen is None else (chosen.coverage,)
     log_odds = unlisted_log_odds(artifact, lists.v, coverages)
-    best = int(np.argmax([_mean_rank(z, lists) for z in log_odds]))
-    z, row, truth = _first_classes(log_odds[best], lists)
-    log_n = np.log(np.maximum(lists.v.sum(1).numpy(), 1))
+    best = int(np.argmax([_mean_reciprocal_rank(values, lists) for values in log_odds]))
+    first_log_odds, row, truth = _first_classes(log_odds[best], lists)
+    log_n = np.log(np.maximum(lists.v.sum(1).numpy(), 1))  # of the listed classes
     entries: dict[str, Any] = {"coverage": coverages[best]}
-    if (missing := fit_count_slope(z, log_n[row], truth)) is not None:
+    if (missing := fit_count_slope(first_log_odds, log_n[row], truth)) is not None:
         entries["missing"] = missing
     parts = _draw_lists(scenes, structure, (*map(share_of, COVERED), all_but_one))
     if len(parts.v):
@@ -145,17 +145,17 @@ def fit_missing(
 
 def _fit_covered(artifact: SceneModel, parts: _Lists) -> CoverageFit:
     """Fit `covered` to the first classes of parts, given the share of the scene that they list."""
-    n, hidden = parts.v.sum(1).numpy(), parts.hidden.sum(1)
+    n, hidden = parts.v.sum(1).numpy(), parts.hidden.sum(1)  # numbers of classes of each part
     # The model's base rates for a complete list are those of all classes but one.
     share = np.where(hidden == 1, 1.0, n / (n + hidden))
     every = np.arange(artifact.spec.V)
     lists = zip(parts.v, share.tolist(), strict=True)
     rows = [posterior_of(artifact, v).absent_log_odds(every, s) for v, s in lists]
-    z, row, truth = _first_classes(np.array(rows, np.float64), parts)
+    log_odds, row, truth = _first_classes(np.array(rows, np.float64), parts)
     if len(np.unique(truth)) < 2:
         return CoverageFit()
     log_n, log_s = np.log(n)[row], np.log(np.maximum(share, LEAST_COVERAGE))[row]
-    features = np.stack([z, log_n, log_s, log_n * log_s, share[row] == 1], 1)
+    features = np.stack([log_odds, log_n, log_s, log_n * log_s, share[row] == 1], 1)
     *slopes, intercept = logistic(features, truth, C=RIDGE)
     names = ("slope", "log_count", "log_share", "both", "last")
     return CoverageFit(intercept=intercept, **dict(zip(names, slopes, strict=True)))
@@ -193,28 +193,29 @@ def unlisted_log_odds(
     return np.stack(rows, 1)
 
 
-def _mean_rank(z: Float[NDArray, "N V"], parts: _Lists) -> float:
-    """Return the mean reciprocal rank of hidden classes among the other candidates."""
-    ranks = []
-    for row, usable, truth in zip(z, parts.candidates, parts.hidden, strict=True):
-        if not truth.any():
+def _mean_reciprocal_rank(log_odds: Float[NDArray, "N V"], parts: _Lists) -> float:
+    """Return the mean reciprocal rank of hidden classes among candidates that are not hidden."""
+    means = []
+    for row, usable, hidden in zip(log_odds, parts.candidates, parts.hidden, strict=True):
+        if not hidden.any():
             continue
-        others = np.sort(row[usable & ~truth])
-        above = len(others) - np.searchsorted(others, row[truth], side="right")
-        ranks.append((1.0 / (1.0 + above)).mean())
-    return float(np.mean(ranks))
+        others = np.sort(row[usable & ~hidden])
+        above = len(others) - np.searchsorted(others, row[hidden], side="right")
+        means.append((1.0 / (1.0 + above)).mean())
+    return float(np.mean(means))
 
 
 def _first_classes(
-    z: Float[NDArray, "N V"], parts: _Lists
+    log_odds: Float[NDArray, "N V"], parts: _Lists
 ) -> tuple[Float[NDArray, "k"], Int[NDArray, "k"], Bool[NDArray, "k"]]:
-    """Return log-odds, part and truth of the first classes that the source of a part can show."""
-    first = np.argsort(np.where(parts.candidates, -z, np.inf), axis=1, kind="stable")[:, :_LISTED]
-    rows = np.broadcast_to(np.arange(len(z))[:, None], first.shape)
-    # A small vocabulary has fewer candidates.
+    """Return log-odds, part and truth (hidden) of the `_LISTED` likeliest candidates of parts."""
+    keys = np.where(parts.candidates, -log_odds, np.inf)
+    first = np.argsort(keys, axis=1, kind="stable")[:, :_LISTED]
+    rows = np.broadcast_to(np.arange(len(log_odds))[:, None], first.shape)
+    # With few candidates, other classes fill the list. Unannotated classes have no known truth.
     usable = (parts.candidates & parts.annotated)[rows, first]
     row, classes = rows[usable], first[usable]
-    return z[row, classes].astype(np.float64), row, parts.hidden[row, classes]
+    return log_odds[row, classes].astype(np.float64), row, parts.hidden[row, classes]
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,6 +291,7 @@ def score_lists(
     log_odds = np.zeros(v.shape)
     for k, (row, values) in enumerate(zip(v, log_odds, strict=True)):
         room = None if rooms is None else rooms[k]
+        # The log-odds of each listed class given the other listed classes.
         values[row] = posterior_of(artifact, torch.from_numpy(row), room).given_rest()[0]
     row, classes = at = np.nonzero(v & judged_classes(artifact))
     can_alarm = ~artifact.rarely_shown[classes]
@@ -383,7 +385,7 @@ def fit_line(worst: Mapping[int, Float[NDArray, "N"]], share: float) -> AlarmLin
     numbers = np.sqrt([len(values) for values in lists])
     fit = np.polyfit(sizes, quantiles, min(2, (len(sizes) - 1) // 2), w=numbers)
     curve, slope, _ = (0.0, 0.0, *fit.tolist())[-3:]
-    line = (curve * sizes + slope) * sizes
+    line = (curve * sizes + slope) * sizes  # height of the shape at each length
     above = np.concatenate([values - height for values, height in zip(lists, line, strict=True)])
     weight = np.concatenate([np.full(len(values), 1 / len(values)) for values in lists])
     limit = quantile_of(above, weight, 1 - MARGIN * share)

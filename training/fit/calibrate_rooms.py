@@ -104,7 +104,7 @@ def rare_rooms(artifact: SceneModel, train: SceneTensors, seed: int = 0) -> tupl
     rng, things = np.random.default_rng(seed), ~artifact.vocabulary.structure
     rare = []
     for t in range(artifact.spec.C):
-        v = train.v[train.room == t].numpy()[:, things] > 0
+        v = train.v[train.room == t].numpy()[:, things] > 0  # scenes of the room type
         if len(v) >= _ENOUGH_SCENES:
             continue
         if len(v) >= _FEW_SCENES:
@@ -125,7 +125,7 @@ def _samples(artifact: SceneModel, room: int, seed: int) -> Bool[NDArray, "N V"]
 
 
 def _resemblance(first: Bool[NDArray, "N V"], second: Bool[NDArray, "M V"]) -> float:
-    """Return sum_i min(p_i, q_i) / sum_i max(p_i, q_i) of the shares of scenes with class i."""
+    """Return sum_i min(p_i, q_i) / sum_i max(p_i, q_i) of the shares p and q of each class i."""
     p, q = first.mean(0), second.mean(0)
     return float(np.minimum(p, q).sum() / max(np.maximum(p, q).sum(), 1e-9))
 
@@ -142,17 +142,17 @@ def limits(artifact: SceneModel, train: SceneTensors) -> dict[str, Any]:
     rooms = subset(train, of_whole_rooms) if of_whole_rooms.any() else train
     parts = [draw_parts(rooms, structure_of(artifact), _part_of(share)) for share in _PARTS]
     lists = [_ListedRooms.of(rooms, part) for part in parts]
-    least = lists[0].smallest() if len(lists[0].size) else 0
+    smallest_of_all = lists[0].smallest() if len(lists[0].size) else 0
     smallest, fits = [], []
     for t in range(artifact.spec.C):
-        own = [each.rows(each.room == t) for each in lists]
-        if len(np.unique(own[0].scene)) < _ROOM_SCENES:
-            smallest.append(least)
+        of_type = [rooms_of_share.rows(rooms_of_share.room == t) for rooms_of_share in lists]
+        if len(np.unique(of_type[0].scene)) < _ROOM_SCENES:
+            smallest.append(smallest_of_all)
             fits.append(NO_LIMIT)
         else:
-            smallest.append(own[0].smallest())
-            fits.append(_fit_limit(artifact, own, t))
-    return {"smallest": (*smallest, least), "room_fit": tuple(fits)}
+            smallest.append(of_type[0].smallest())
+            fits.append(_fit_limit(artifact, of_type, t))
+    return {"smallest": (*smallest, smallest_of_all), "room_fit": tuple(fits)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +177,7 @@ class _ListedRooms(Table):
 
 def _fit_limit(artifact: SceneModel, lists: Sequence[_ListedRooms], room: int) -> FitLimit:
     """Return the limit of the fit from lists of a room type, one entry for each of `_PARTS`."""
-    # A quantile of few whole rooms is that of the worst: a small machine cannot follow.
+    # The quantile over few whole rooms is the worst room, so only the smallest parts count then.
     lists = lists if len(np.unique(lists[0].scene)) >= _LONG_SCENES else lists[:1]
     quantiles = []
     for parts in lists:

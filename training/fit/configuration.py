@@ -157,8 +157,10 @@ class Config(_Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> Config:
+        """Check entries that depend on each other. Raise ValueError for the first broken rule."""
         kind = VARIANTS[self.machine.variant]
         if self.machine.without:
+            # A smallest machine of the variant tells the names of its weights.
             smallest = build(MachineSpec(self.machine.variant, V=1, A=1, units=1, K=1))
             names = [name for name, _ in smallest.named_parameters()]
             if unknown := sorted(set(self.machine.without) - set(names)):
@@ -166,6 +168,7 @@ class Config(_Section):
                     f"machine.without: a {self.machine.variant} has no weights "
                     f"{', '.join(unknown)}, only {', '.join(names)}"
                 )
+        # Each message with the condition that breaks its rule.
         rules = {
             "machine.G is defined for the Triway only: it must be 0": (
                 self.machine.G and not kind.factorised

@@ -64,7 +64,7 @@ def fit_counts(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> Counts
     scenes = at_most(scenes, lambda scene: (scene.source, scene.group), _OF_GROUP)
     counted = {source: classes & (most > 0) for source, classes in counted.items()}
     cases = _Cases.of(scenes, counted, vocabulary)
-    most *= _is_better_than_mean(scenes, cases, most, counted, vocabulary)
+    most *= _is_better_than_mean(scenes, cases, most, counted, vocabulary)  # 0: no statistics
     cases = cases.rows(most[cases.index] > 0)
     return _fit(cases, most, vocabulary) if (most > 1).any() else None
 
@@ -75,6 +75,7 @@ def _fit(cases: _Cases, most: Int[NDArray, "V"], vocabulary: Vocabulary) -> Coun
     weights = _weights(cases, log_frequency, most > 0)
     # The exponent -1 stands for the listed number, which is uniform from 1 to n.
     weights[:, 0, INTERCEPT] -= 1.0
+    # A class is no feature of its own number.
     itself = ROOM + len(vocabulary.room_types) + np.arange(len(vocabulary))
     weights[np.arange(len(vocabulary)), :, itself] = 0.0
     classes = np.flatnonzero(most)
@@ -94,8 +95,9 @@ def _most_listed(
         scene_counts[classes] += 1
         of_group = largest.setdefault((scene.source, scene.group), np.zeros_like(scene_counts))
         of_group[classes] = np.maximum(of_group[classes], counts)
-    every = np.array([*largest.values()]).reshape(-1, len(vocabulary))
-    groups = np.stack([(every >= number).sum(0) for number in range(2, MOST)])
+    of_groups = np.array([*largest.values()]).reshape(-1, len(vocabulary))
+    # Rows: number of groups with at least 2, 3, … instances of each class.
+    groups = np.stack([(of_groups >= number).sum(0) for number in range(2, MOST)])
     most = np.maximum(2, 1 + (groups >= _GROUPS_OF_MANY).sum(0))
     return np.where((scene_counts >= _SCENES) & (groups[0] >= _GROUPS), most, 0)
 
@@ -149,7 +151,7 @@ def _features(
     others, listed = np.delete(part.classes, k), np.delete(part.listed, k)
     columns = [INTERCEPT, SINGLE, SEVERAL, *(start + others).tolist()]
     values = [1.0, float(part.listed[k] == 1), float((listed > 1).any())]
-    values += [1 / math.sqrt(max(len(others), 1))] * len(others)
+    values += [1 / math.sqrt(max(len(others), 1))] * len(others)  # a vector of length 1
     if part.room >= 0:
         columns.append(ROOM + part.room)
         values.append(1.0)
@@ -168,7 +170,11 @@ def _log_frequencies(cases: _Cases, V: int) -> Float[NDArray, "V M"]:
 def _weights(
     cases: _Cases, log_frequency: Float[NDArray, "V M"], fitted: ClassMask
 ) -> Float[NDArray, "V 2 3+C+V"]:
-    """Return the weights of each class by maximum penalised likelihood."""
+    """Return the weights of each class by maximum penalised likelihood.
+
+    A weight is a term of the class plus a shared term. The columns of `all_terms` are the terms of
+    the classes that have enough cases, followed by the shared terms.
+    """
     features, (N, width), V = cases.features, cases.features.shape, len(fitted)
     # The terms of a class act only on cases of this class.
     entries = features.tocoo()
@@ -181,6 +187,8 @@ def _weights(
     used_columns = columns[cases_of >= _OWN_CASES]
     all_terms = sparse.hstack([class_terms[:, used_columns], features]).tocsr()
     penalty = np.repeat([_OWN, _SHARED], [len(used_columns), width])[:, None]
+    # Logits of the numbers n: log s(n) - log n, plus a line and a parabola in log n whose
+    # coefficients are the terms. A number below the listed one is impossible.
     numbers = np.arange(1, MOST + 1)
     log = np.log(numbers)
     of_number = np.stack([log, log * (math.log(MOST) - log)])
@@ -189,6 +197,7 @@ def _weights(
     base[numbers[:, None] < cases.listed] = -np.inf
 
     def loss(flat: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """Return the penalised negative log-likelihood of the flattened terms, and its gradient."""
         terms = flat.reshape(-1, EXPONENTS)
         logits = of_number.T @ (all_terms @ terms).T
         logits += base

@@ -55,7 +55,7 @@ def fit_places(
         relation, subject, anchor = np.nonzero(evidence.holds)
         i, j = evidence.classes[subject], evidence.classes[anchor]
         counted = is_thing[i] & is_thing[j] & (i != j)
-        blocks.append(((relation * V + i) * V + j)[counted])
+        blocks.append(((relation * V + i) * V + j)[counted])  # one key for each triple
     keys, scene_counts = np.unique(np.concatenate(blocks), return_counts=True)
     if not len(keys):
         return None

@@ -107,6 +107,7 @@ class LongChains:
         count: int,
         seed: int,
     ) -> None:
+        """Start `count` chains at scenes drawn from the population."""
         index = population.draw(count, np.random.default_rng(seed))
         self.on = scenes.v[index].numpy().astype(np.uint8)
         self._chains, self._profile = chains, population.profile
@@ -212,6 +213,7 @@ def served_frequencies(
     refused = np.zeros(len(long.on), np.int64)  # states since the last served scene
 
     def accepts(k: int) -> bool:
+        """Return True if the service would answer with the state of chain k."""
         room = None if long.rooms[k] < 0 else int(long.rooms[k])
         return is_plausible(artifact, evidence, np.flatnonzero(long.on[k]), room)
 
@@ -238,6 +240,7 @@ def fit_scene_rates(
         average = np.zeros(u.shape[1])
         for number in range(_ROUNDS):
             drawn = long.run(sweeps).mean(0)
+            # Steps fall geometrically. u is the average over the second half of the rounds.
             step = _FIRST_STEP * (_LAST_STEP / _FIRST_STEP) ** (number / (_ROUNDS - 1))
             change = step * (_log_odds(population.p, sweeps) - _log_odds(drawn, sweeps))
             u[row] += np.where(population.shows, np.clip(change, -1, 1), 0)

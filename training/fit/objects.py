@@ -67,26 +67,32 @@ class ObjectScenes:
 
     @classmethod
     def of(cls, train: SceneTensors, structure: Bool[Tensor, "V"], config: ObjectsConfig) -> Self:
+        """Choose the usable training scenes, and the classes that each data source can show.
+
+        Raises:
+            ValueError: no scene is usable.
+        """
         names, annotated = train.source_names, train.annotated_classes
-        weights = torch.tensor([config.source_weights.get(q, 1.0) for q in names])
+        source_weights = torch.tensor([config.source_weights.get(q, 1.0) for q in names])
         counts = torch.zeros(annotated.shape).index_add_(0, train.source, (train.v > 0).float())
         # Own sources and open vocabularies show every class but incompletely annotated ones.
         is_open = [q not in SOURCES or SOURCES[q].open_vocabulary for q in names]
         shows_all = [q in config.open_sources for q in names] if config.open_sources else is_open
-        partial = torch.tensor([q in SOURCES for q in names]) & torch.tensor(is_open)
-        partial = partial.unsqueeze(1) & ~annotated
-        shows = (counts >= _SHOWN) & annotated | torch.tensor(shows_all).unsqueeze(1) & ~partial
+        public_open = torch.tensor([q in SOURCES for q in names]) & torch.tensor(is_open)
+        incomplete = public_open.unsqueeze(1) & ~annotated
+        shows = (counts >= _SHOWN) & annotated | torch.tensor(shows_all).unsqueeze(1) & ~incomplete
         shows &= ~structure
         v = (train.v > 0) & shows[train.source]
-        weight = train.weight * weights[train.source]
-        kept = ((weight > 0) & (v.sum(1) >= 2)).nonzero().squeeze(1)
-        if not len(kept):
+        weight = train.weight * source_weights[train.source]
+        usable = ((weight > 0) & (v.sum(1) >= 2)).nonzero().squeeze(1)
+        if not len(usable):
             raise ValueError("no training scene has two classes; add scenes with more objects")
-        used, source = train.source[kept].unique(return_inverse=True)
-        sources, v = tuple(names[q] for q in used.tolist()), v[kept]
+        # Sources without a usable scene have no entry, so the indices of sources change.
+        used, source = train.source[usable].unique(return_inverse=True)
+        sources, v = tuple(names[q] for q in used.tolist()), v[usable]
         observed = shows[used][source] & (v | ~train.relatives_of(v.float()))
         return cls(
-            v=v.float(), room=train.room[kept], source=source, weight=weight[kept],
+            v=v.float(), room=train.room[usable], source=source, weight=weight[usable],
             shows=shows[used], observed=observed, sources=sources,
         )  # fmt: skip
 
@@ -130,11 +136,11 @@ def random_parts(
     v: Float[Tensor, "B V"], leave_one_out: float, generator: torch.Generator
 ) -> Parts:
     """List a random part of each scene; a share `leave_one_out` of the parts hides one class."""
-    n = v.sum(1)
+    n = v.sum(1)  # number of classes of each scene
     hides_one = torch.rand(len(v), generator=generator) < leave_one_out
     share = _LEAST_SHARE + (1 - _LEAST_SHARE) * torch.rand(len(v), generator=generator)
     count = torch.where(hides_one, n - 1, (share * n).round().clamp(min=1).minimum(n - 1))
-    # Listed are the `count` present classes with the smallest random keys.
+    # Listed are the `count` present classes with the smallest random keys; absent ones are above 2.
     keys = torch.rand(v.shape, generator=generator) + 2 * (1 - v)
     smallest = keys.topk(int(count.max()), largest=False).values
     listed = v * (keys <= smallest.gather(1, count.long().unsqueeze(1) - 1))
@@ -147,9 +153,11 @@ class ObjectFit:
     def __init__(
         self, machine: BoltzmannMachine, scenes: ObjectScenes, config: ObjectsConfig, seed: int
     ) -> None:
+        """Prepare the optimiser of the object weights and, if the loss has them, the chains."""
         self.machine, self.scenes, self.config = machine, scenes, config
         self.steps, self.loss = 0, math.nan
         self._generator = torch.Generator().manual_seed(seed)
+        # A weight that classes share by word vectors has a name such as "parametrizations.W.0.map".
         self._weights = {
             name: weight
             for name, weight in machine.named_parameters()
@@ -189,12 +197,14 @@ class ObjectFit:
         self._optimiser.zero_grad()
         loss.backward()
         if (couplings := self.machine.couplings) is not None and couplings.grad is not None:
+            # A symmetric gradient keeps the couplings L symmetric, with a diagonal of 0.
             couplings.grad = (couplings.grad + couplings.grad.T).fill_diagonal_(0).div_(2)
         self._optimiser.step()
         self.steps += 1
         self._add_to_average()
 
     def _batch_loss(self) -> Tensor:
+        """Return the loss of the module over a random batch of scenes."""
         scenes = self.scenes
         index = scenes.draw(self.config.batch_size, self._generator)
         loss = self._conditional_loss(index)
@@ -215,10 +225,11 @@ class ObjectFit:
         log_odds = machine.object_log_odds(
             parts.listed, room=listed_room, source=source, share=parts.share
         )
-        hidden = v - parts.listed
+        hidden = v - parts.listed  # 1 for present classes that are not listed
         weight = scenes.observed[index] * (1 - parts.listed)
         weight = weight * torch.where(hidden > 0, parts.weight.unsqueeze(1), 1.0)
         loss = ((softplus(log_odds) - hidden * log_odds) * weight).sum()
+        # The data source given the listed classes.
         rates, _ = with_served_rates(machine.a, scenes.shows, served_weights(scenes, self.config))
         logits = machine.f + parts.listed @ rates.T
         loss = loss + self.config.source_loss * cross_entropy(logits, source, reduction="sum")
@@ -242,13 +253,14 @@ class ObjectFit:
     ) -> Float[Tensor, ""]:
         """Return F(scenes) - F(chains) given the room types, which the chains keep."""
         sweep(self.machine, chains, self._generator, classes=self.config.classes_per_sweep)
-        n = len(v)
+        count = len(v)
         v, room, source = (
             torch.cat(pair)
             for pair in ((v, chains.v), (room, chains.room), (source, chains.source))
         )
+        # F given the room type: the bias of the room type cancels.
         free = self.machine.free_energy(v, room, source) + self.machine.room_rate(room, source)
-        return free[:n].mean() - free[n:].mean()
+        return free[:count].mean() - free[count:].mean()
 
     def _schedule(self) -> float:
         """Return the factor of the learning rate: it rises, stays, and falls along a cosine."""
@@ -261,6 +273,7 @@ class ObjectFit:
 
     @torch.no_grad()
     def _add_to_average(self) -> None:
+        """Update the mean of the weights over the last share `_AVERAGED` of the steps."""
         count = self.steps - int((1 - _AVERAGED) * self.config.steps)
         for name, weight in self._weights.items() if count > 0 else ():
             self._average[name].lerp_(weight, 1 / count)
@@ -284,6 +297,7 @@ class ObjectFit:
             rates.copy_(complete - mix)
             bias.add_(mix)
         served = served.clamp(min=_UNSERVED)
+        # p(q) becomes the share of the source in the served mix, instead of that in training.
         machine.f.add_((served / served.sum() * scenes.size / scenes.source_sizes).log())
 
 
@@ -292,14 +306,21 @@ def with_served_rates(
     shows: Bool[Tensor, "sources k|1"],
     served: Float[Tensor, "sources"],
 ) -> tuple[Float[Tensor, "sources k"], Float[Tensor, "k"]]:
-    """Return rates a or y, completed by the mean over the served sources, and this mean."""
+    """Return the rates of sources, completed by the mean over the served sources, and this mean.
+
+    A source that does not show a class (or room types) gets the mean as its rate. `served` has the
+    weights of the sources in the mean.
+    """
     weights = served.unsqueeze(1) * shows
     mean = (weights * rates).sum(0) / weights.sum(0).clamp(min=1e-9)
     return torch.where(shows, rates, mean), mean
 
 
 def served_popularity(scenes: ObjectScenes, config: ObjectsConfig) -> Float[Tensor, "V"]:
-    """Return the log-odds of each class in a scene of the served mix; NaN without scenes."""
+    """Return the log-odds of each class in a scene of the served mix; NaN without scenes.
+
+    A class that no served source shows has the lowest rate of all.
+    """
     count = torch.zeros(scenes.shows.shape)
     count.index_add_(0, scenes.source, scenes.v * scenes.weight.unsqueeze(1))
     share = (count + 0.5) / (scenes.source_sizes.unsqueeze(1) + 1)

@@ -46,6 +46,7 @@ def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
     if not len(observed):
         return None
     A = len(CANONICAL)
+    # Six columns: the means of x, y and z, and then their variances.
     relation, scenes_of = np.zeros((A, 6)), np.zeros(A, dtype=np.int32)
     effects = np.zeros((2, A, V, 6))
     pair, moments, counts = [], [], []
@@ -86,6 +87,7 @@ class _Pairs(NamedTuple):
 
 def _pool_pairs(observed: ObservedOffsets) -> _Pairs:
     """Compute the moments of each pair of classes. Its offsets in a scene share the weight 1."""
+    # `pair` is the number of the pair of classes of each offset.
     classes = np.stack([observed.subject, observed.other])
     (subject, object_), pair = np.unique(classes, axis=1, return_inverse=True)
     # Group the offsets by scene and pair of classes.
@@ -137,12 +139,15 @@ class _Fit:
     def predict(self, pairs: _Pairs) -> tuple[Float[NDArray, "P 3"], Float[NDArray, "P 3"]]:
         """Return mean and variance of a new offset of each pair."""
         var_u, var_v = self.effect_variances
+        # Uncertain class effects make the prior mean uncertain, which lowers its precision.
         kappa = self.kappa / (1 + var_u[pairs.subject] + var_v[pairs.object])
         prior = self.expected(pairs), kappa, self.alpha, self.beta
         return posterior(prior, pairs.n, pairs.mean, pairs.scatter)
 
     def tables(self) -> tuple[Float[NDArray, "6"], Float[NDArray, "2 V 6"]]:
         """Return tables whose sum gives mean and variance of a pair without data, as `predict`."""
+        # The mean variance s, and the variance of the effect of a class without data. The entry of
+        # the relation contains that of two such classes, and a class adds its difference.
         spread, unknown = self.beta / (self.alpha - 1), 1 / LAMBDA
         relation = np.concatenate([self.mu, spread * (1 + (1 + 2 * unknown) / self.kappa)])
         variances = spread * (self.effect_variances - unknown) / self.kappa
@@ -155,27 +160,27 @@ Prior = tuple[Any, Any, Any, Any]
 
 def posterior(prior: Prior, n: Any, mean: Any, scatter: Any) -> tuple[Any, Any]:
     """Return mean and variance of a new value given n values; alpha + n / 2 is above 1."""
-    after, shape, rate = _updated(prior, n, mean, scatter)
     expected, kappa, _, _ = prior
-    return (kappa * expected + n * mean) / after, rate / (shape - 1) * (1 + 1 / after)
+    new_kappa, alpha, beta = _updated(prior, n, mean, scatter)
+    return (kappa * expected + n * mean) / new_kappa, beta / (alpha - 1) * (1 + 1 / new_kappa)
 
 
 def log_likelihood(prior: Prior, n: Any, mean: Any, scatter: Any) -> Any:
     """Return the log-likelihood of n values, with their mean and variance integrated out."""
-    after, shape, rate = _updated(prior, n, mean, scatter)
     _, kappa, alpha, beta = prior
+    new_kappa, new_alpha, new_beta = _updated(prior, n, mean, scatter)
     return (
-        gammaln(shape) - gammaln(alpha) + alpha * np.log(beta) - shape * np.log(rate)
-        + (np.log(kappa) - np.log(after) - n * np.log(2 * np.pi)) / 2
+        gammaln(new_alpha) - gammaln(alpha) + alpha * np.log(beta) - new_alpha * np.log(new_beta)
+        + (np.log(kappa) - np.log(new_kappa) - n * np.log(2 * np.pi)) / 2
     )  # fmt: skip
 
 
 def _updated(prior: Prior, n: Any, mean: Any, scatter: Any) -> tuple[Any, Any, Any]:
     """Return kappa, alpha and beta of the posterior."""
     expected, kappa, alpha, beta = prior
-    after = kappa + n
-    rate = beta + scatter / 2 + kappa * n * np.square(mean - expected) / (2 * after)
-    return after, alpha + n / 2, rate
+    new_kappa = kappa + n
+    new_beta = beta + scatter / 2 + kappa * n * np.square(mean - expected) / (2 * new_kappa)
+    return new_kappa, alpha + n / 2, new_beta
 
 
 def _fit(pairs: _Pairs, V: int) -> _Fit:
@@ -192,6 +197,9 @@ def _fit(pairs: _Pairs, V: int) -> _Fit:
 
 
 def _fit_prior(pairs: _Pairs, axis: int, expected: Float[NDArray, "P"]) -> Float[NDArray, "3"]:
+    """Return kappa, alpha and beta of an axis by maximum likelihood, given the expected means."""
+
+    # The logarithms of the parameters are optimised, so these stay positive.
     def loss(logs: NDArray[np.float64]) -> float:
         n, mean, scatter = pairs.n[:, 0], pairs.mean[:, axis], pairs.scatter[:, axis]
         return -float(log_likelihood((expected, *np.exp(logs)), n, mean, scatter).sum())

@@ -54,7 +54,7 @@ def fit_count_slope(
     weight: Float[NDArray, "N"] | None = None,
     C: float = RIDGE,
 ) -> CountSlope | None:
-    """Fit the truth to log-odds and the log of a number of objects; None without both values."""
+    """Regress the truth on log-odds and the log of an object count; None for a constant truth."""
     if len(np.unique(truth)) < 2:
         return None
     slope, count, intercept = logistic(np.stack([log_odds, log_count], 1), truth, weight, C)

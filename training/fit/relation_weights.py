@@ -69,18 +69,20 @@ class RelationFit:
     def __init__(
         self, machine: BoltzmannMachine, train: SceneTensors, config: RelationsConfig, seed: int
     ) -> None:
+        """Select the scenes with annotated relations, and prepare offsets and optimiser."""
         self.config, self.machine = config, machine
         annotated = [k for k, scene in enumerate(train.scenes) if scene.evidence.observed.any()]
         self.train = subset(train, torch.tensor(annotated, dtype=torch.int64))
         sizes = [len(scene.evidence.classes) for scene in self.train.scenes]
         self._log_sizes = torch.tensor(sizes).clamp(1, _MOST_CLASSES).log()
-        self.epochs = self._updates = 0  # finished
+        self.epochs = self._updates = 0  # numbers of finished epochs and updates
         self._generator = torch.Generator().manual_seed(seed)
         # Corrections of the logits for each data source.
         self.offsets = nn.Parameter(torch.zeros(len(train.source_names), machine.spec.A))
         self._source_weights = torch.tensor(
             [config.source_weights.get(name, 1.0) for name in train.source_names]
         )
+        # Probability that an epoch draws each scene. Weights above 1 multiply the loss instead.
         self._shares = self._source_weights.clamp(max=1)[self.train.source]
         self._size = float(self._shares.sum())  # expected scenes of an epoch
         named = machine.named_parameters()
@@ -94,7 +96,7 @@ class RelationFit:
     def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         """Return -log likelihood / scenes of the batch - log prior / scenes of an epoch."""
         machine = self.machine
-        if self.config.count_dropout:
+        if self.config.count_dropout:  # the service often gets no instance counts
             hidden = torch.rand(len(batch), 1, generator=generator) < self.config.count_dropout
             batch = replace(batch, counts=batch.counts.masked_fill(hidden, 0))
         edges, r, observed = machine.lay_out(batch)
@@ -105,7 +107,7 @@ class RelationFit:
         weight = self._source_weights[batch.source].clamp(min=1).unsqueeze(1)
         weight = observed * machine.gate(edges, batch.v) * weight
         nll = _nll(logits, r, weight)
-        if machine.spec.G:
+        if machine.spec.G:  # a random share of the true relations is the condition
             share = torch.rand(len(r), 1, generator=generator)
             condition = r * observed * (torch.rand(r.shape, generator=generator) < share)
             shifted = logits + machine.implied(edges, condition, h1)
@@ -146,10 +148,11 @@ class RelationFit:
     def _batches(self) -> list[Tensor]:
         """Return an epoch in random batches of similar scenes: large ones make a batch slow."""
         noise, draw = torch.rand(2, len(self.train), generator=self._generator)
-        order = (self._log_sizes + _MIXING * noise).argsort()
-        batches = order[draw[order] < self._shares[order]].split(self.config.batch_size)
-        turn = torch.randperm(len(batches), generator=self._generator).tolist()
-        return [batches[k] for k in turn]
+        by_size = (self._log_sizes + _MIXING * noise).argsort()
+        drawn = by_size[draw[by_size] < self._shares[by_size]]
+        batches = drawn.split(self.config.batch_size)
+        order = torch.randperm(len(batches), generator=self._generator).tolist()
+        return [batches[k] for k in order]
 
     def _part(self, evidence: ClassEvidence) -> ClassEvidence:
         """Return the evidence about at most `_MOST_CLASSES` random classes of a scene."""
@@ -228,11 +231,13 @@ class Sharing(nn.Module):
         *,
         columns: bool,  # the weights have the shape (width, V), else (V, width)
     ) -> None:
+        """Start with a map of 0, so that the weights are those of the classes and parents."""
         super().__init__()
         self.words, self.parents, self.columns = words, parents, columns
         self.map = nn.Parameter(torch.zeros(words.shape[1], width))
 
     def forward(self, deviation: Tensor) -> Tensor:
+        """Return the weights of all classes from the trained deviation of each class."""
         own = deviation.T if self.columns else deviation
         inherited = own[self.parents.clamp(min=0)] * (self.parents >= 0).unsqueeze(1)
         total = own + inherited + self.words @ self.map
@@ -291,7 +296,11 @@ def means_of_parts(
 def lower_unseen_roles(
     machine: BoltzmannMachine, train: SceneTensors, parents: Int[Tensor, "V"]
 ) -> None:
-    """Lower the weights of classes that no training scene shows on, in or above an object."""
+    """Lower the weights of classes that no training scene shows on, in or above an object.
+
+    The subject and the object of a relation are two roles, with the weights s and o. A class with
+    fewer than `_CHANCES` annotated scenes keeps its weights.
+    """
     # Factors extrapolate: they put windows on tables. Roles of the parent and of kinds count.
     seen = np.zeros((2, machine.spec.A, machine.spec.V), dtype=np.bool_)
     chances = np.zeros(seen.shape, dtype=np.int64)
@@ -299,12 +308,12 @@ def lower_unseen_roles(
         relation, subject, object_ = scene.evidence.holds.nonzero()
         classes = scene.evidence.classes
         seen[0, relation, classes[subject]] = seen[1, relation, classes[object_]] = True
-        for role, partners in ((0, 2), (1, 1)):
-            chances[role][:, classes] += scene.evidence.observed.any(partners)
-    parent_of, own = parents.numpy(), seen.copy()
+        for role, partner_axis in ((0, 2), (1, 1)):
+            chances[role][:, classes] += scene.evidence.observed.any(partner_axis)
+    parent_of, seen_itself = parents.numpy(), seen.copy()
     for kind in np.flatnonzero(parent_of >= 0).tolist():
-        seen[..., parent_of[kind]] |= own[..., kind]
-        seen[..., kind] |= own[..., parent_of[kind]]
+        seen[..., parent_of[kind]] |= seen_itself[..., kind]
+        seen[..., kind] |= seen_itself[..., parent_of[kind]]
     unseen = torch.from_numpy(~seen & (chances >= _CHANCES))
     for a in STACKED:
         if a < machine.spec.A:
@@ -343,24 +352,25 @@ def with_counted_residuals(
         weight = source_weights[batch.source].unsqueeze(1).expand_as(logits)
         columns.append([values[annotated] for values in (key, logits, r, weight)])
     keys, logits, r, weight = (torch.cat(blocks) for blocks in zip(*columns, strict=True))
-    z, holds, weights = (values.double().numpy() for values in (logits, r, weight))
-    triples, which, counts = np.unique(keys.numpy(), return_inverse=True, return_counts=True)
+    log_odds, holds, weights = (values.double().numpy() for values in (logits, r, weight))
+    # All annotations of a triple are one logistic regression of the single weight δ.
+    triples, triple_of, counts = np.unique(keys.numpy(), return_inverse=True, return_counts=True)
     delta = np.zeros(len(triples))
     for _ in range(_NEWTON_STEPS):
-        p = expit(z + delta[which])
-        slope = np.bincount(which, weights * (holds - p), len(triples)) - _PRECISION * delta
-        curvature = np.bincount(which, weights * p * (1 - p), len(triples)) + _PRECISION
-        delta += (slope / curvature).clip(-2, 2)
+        p = expit(log_odds + delta[triple_of])
+        slope = np.bincount(triple_of, weights * (holds - p), len(triples)) - _PRECISION * delta
+        curvature = np.bincount(triple_of, weights * p * (1 - p), len(triples)) + _PRECISION
+        delta += (slope / curvature).clip(-2, 2)  # a bound, so that Newton's method converges
     residuals = dict(
         zip(machine.triple_keys.tolist(), machine.get_parameter("residual").tolist(), strict=True)
     )
-    kept = (counts >= _SPEAKING_SCENES) & (np.abs(delta) >= _LEAST_RESIDUAL)
-    for key, value in zip(triples[kept].tolist(), delta[kept].tolist(), strict=True):
+    is_stored = (counts >= _SPEAKING_SCENES) & (np.abs(delta) >= _LEAST_RESIDUAL)
+    for key, value in zip(triples[is_stored].tolist(), delta[is_stored].tolist(), strict=True):
         residuals[key] = residuals.get(key, 0.0) + value
-    table = torch.tensor(sorted(residuals), dtype=torch.int64)
+    keys = torch.tensor(sorted(residuals), dtype=torch.int64)  # (a V + i) V + j
     state = machine.state_dict()
-    state["triples"] = torch.stack([table // V // V, table // V % V, table % V], 1).int()
-    state["residual"] = torch.tensor([residuals[key] for key in table.tolist()])
-    larger = build(replace(machine.spec, T=len(table)))
+    state["triples"] = torch.stack([keys // V // V, keys // V % V, keys % V], 1).int()
+    state["residual"] = torch.tensor([residuals[key] for key in keys.tolist()])
+    larger = build(replace(machine.spec, T=len(keys)))
     larger.load_state_dict(state)
     return larger

@@ -86,9 +86,9 @@ def _start_relations(machine: BoltzmannMachine, data: TrainingData) -> None:
     """Set the relation biases to the log-odds of relations in scenes with annotated relations."""
     A, V, T = machine.spec.A, machine.spec.V, machine.spec.T
     holding, observed, per_unit = torch.zeros(A), torch.zeros(A), torch.zeros(T)
-    logs, times = torch.zeros(V), torch.zeros(V)
-    every = [scene.evidence for scene in data.train.scenes]
-    annotated = [evidence for evidence in every if evidence.observed.any()]
+    log_counts, class_scenes = torch.zeros(V), torch.zeros(V)
+    all_evidence = [scene.evidence for scene in data.train.scenes]
+    annotated = [evidence for evidence in all_evidence if evidence.observed.any()]
     for evidence in annotated:
         holding += torch.from_numpy(evidence.holds.sum((1, 2)))
         observed += torch.from_numpy(evidence.observed.sum((1, 2)))
@@ -97,8 +97,8 @@ def _start_relations(machine: BoltzmannMachine, data: TrainingData) -> None:
         keys = triple_keys(relation, classes[subject], classes[object_], V)
         index, exists = find_triples(machine.triple_keys, keys)
         per_unit[index[exists]] += 1
-        logs[classes] += torch.from_numpy(evidence.counts).log()
-        times[classes] += 1
+        log_counts[classes] += torch.from_numpy(evidence.counts).log()
+        class_scenes[classes] += 1
 
     def log_odds(count: Tensor, total: Tensor | int) -> Tensor:
         return ((count + 0.5) / (total - count + 0.5)).log()
@@ -106,7 +106,7 @@ def _start_relations(machine: BoltzmannMachine, data: TrainingData) -> None:
     machine.start_relations(
         by_relation=log_odds(holding, observed),
         by_unit=log_odds(per_unit, len(annotated)),
-        mean_log_counts=logs / times.clamp(min=1),
+        mean_log_counts=log_counts / class_scenes.clamp(min=1),
     )
 
 
@@ -114,6 +114,7 @@ class Trainer:
     """Train one configuration on one set of scenes. `curve` has the points so far."""
 
     def __init__(self, config: Config, data: TrainingData) -> None:
+        """Build the machine, and prepare the phase `objects`."""
         self.config, self.data = config, data
         torch.set_num_threads(config.training.threads)
         self.scenes = ObjectScenes.of(data.train, data.structure, config.objects)
@@ -127,6 +128,7 @@ class Trainer:
     def run(
         self, progress: Progress = lambda *_: None, passed: Passed = lambda _: None
     ) -> TrainingResult:
+        """Train the remaining steps of both phases, and then what only Gibbs chains use."""
         began, seed = time.perf_counter(), self.config.training.seed
 
         def add(point: CurvePoint) -> None:
@@ -139,6 +141,7 @@ class Trainer:
         while not relations.finished:
             add(self._train_relations(relations, progress))
         machine = relations.finish(self.data.parents)
+        # The samples come last, because their chains use the fitted weights u.
         fit_scene_rates(machine, self.scenes, self.config.objects, seed)
         store_samples(machine, self.scenes, seed)
         return TrainingResult(machine, self.curve, time.perf_counter() - began)

@@ -51,7 +51,7 @@ def pair_edges(
     classes: Int[Tensor, "B n"], relations: int, log_counts: Float[Tensor, "B n"] | None = None
 ) -> PairEdges:
     """Return the units between the classes (-1: padding), by default with one instance of each."""
-    B, n = classes.shape
+    B, n = classes.shape  # scenes, and classes of the largest scene
     exists, classes = classes >= 0, classes.clamp(min=0)
     subject, object_ = classes[:, None, :, None], classes[:, None, None, :]
     valid = (exists.unsqueeze(-1) & exists.unsqueeze(-2)).unsqueeze(1)

@@ -56,6 +56,7 @@ class BoltzmannMachine(nn.Module, ABC):
     fantasy_rooms: Tensor
 
     def __init__(self, spec: MachineSpec) -> None:
+        """Make all weights 0. u is fitted after training, so it needs no gradient."""
         super().__init__()
         self.spec = spec
         self.b = nn.Parameter(torch.zeros(spec.V))
@@ -123,8 +124,6 @@ class BoltzmannMachine(nn.Module, ABC):
         doubled = V * (V + 1) // 2 if self.spec.coupled else 0
         return sum(parameter.numel() for parameter in self.parameters()) - doubled
 
-    # ------------------------------------------------------------------ hidden units and objects
-
     @property
     def couplings(self) -> Float[Tensor, "V V"] | None:
         """The symmetric couplings between classes, with a diagonal of 0, or None."""
@@ -159,9 +158,10 @@ class BoltzmannMachine(nn.Module, ABC):
         self, x: Float[Tensor, "B H1"], weights: Float[Tensor, "rows H1"]
     ) -> Float[Tensor, "B rows"]:
         """Return sum_m log sum_z p_m(z) exp(w[m, z]) of each row w; x are the logits of p_m."""
-        states = self._all_states(x).softmax(-1).movedim(-2, 0)
-        factors = self.by_unit(weights).exp().permute(1, 2, 0)
-        return (states[..., :1] + states[..., 1:] @ factors).log().sum(0)
+        p = self._all_states(x).softmax(-1).movedim(-2, 0)  # (units, B, states)
+        factors = self.by_unit(weights).exp().permute(1, 2, 0)  # (units, states - 1, rows)
+        # The first state of a unit has the weight 0, and so the factor 1.
+        return (p[..., :1] + p[..., 1:] @ factors).log().sum(0)
 
     def scene_bias(self, source: Int[Tensor, "B"] | None) -> Float[Tensor, "B|1 V"]:
         """Return b + a[q] + u[q] of whole scenes; for a source q of -1 or None, b + u[-1]."""
@@ -218,7 +218,7 @@ class BoltzmannMachine(nn.Module, ABC):
             logits = logits + sparse_product(v, self.Y.T)
         if not self.spec.profiles:
             return logits.log_softmax(-1)
-        by_source = (logits.unsqueeze(-2) + self.y).log_softmax(-1)
+        by_source = (logits.unsqueeze(-2) + self.y).log_softmax(-1)  # log p(t | v, q)
         return (self.source_weights(v, source).unsqueeze(-1).log() + by_source).logsumexp(-2)
 
     def free_energy(
@@ -234,8 +234,6 @@ class BoltzmannMachine(nn.Module, ABC):
             free = free - (v * self.room_bias(room)).sum(-1)
         log_states = self._all_states(self.hidden_logits(v, room)).logsumexp(-1).sum(-1)
         return free - self.room_rate(room, source) - log_states
-
-    # ---------------------------------------------------------------------------------- relations
 
     @abstractmethod
     def start_relations(

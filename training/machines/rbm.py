@@ -40,6 +40,7 @@ class RBM(BoltzmannMachine):
         by_unit: Float[Tensor, "T"],
         mean_log_counts: Float[Tensor, "V"],
     ) -> None:
+        """Set the bias d of each triple to its log-odds in a scene; other statistics are unused."""
         self.d.copy_(by_unit)
 
     def edges(self, classes: Int[Tensor, "B n"], counts: Int[Tensor, "B n"] | None = None) -> Edges:
@@ -47,8 +48,11 @@ class RBM(BoltzmannMachine):
         return triple_edges(self.triples)
 
     def lay_out(self, scenes: SceneRelations) -> LaidOut:
-        # Relations without a unit are left out. Units of absent classes are 0, and observed if any
-        # relation of the scene is.
+        """Return the units of all triples, their values (B, T), and which are observed.
+
+        Relations without a unit are left out. Units of absent classes are 0, and observed if any
+        relation of the scene is.
+        """
         pairs = pair_edges(scenes.classes, scenes.holds.shape[1])
         keys = triple_keys(pairs.relation, pairs.subject, pairs.object, self.spec.V)
         position, exists = find_triples(self.triple_keys, keys)
@@ -68,6 +72,7 @@ class RBM(BoltzmannMachine):
     def relation_logits(
         self, edges: Edges, v: Float[Tensor, "... B V"], h1: Float[Tensor, "... B H1"]
     ) -> Float[Tensor, "... B E"]:
+        """Return ℓ_t of all triples. It depends on the hidden units only."""
         return self.d + h1 @ self.U.T
 
 
@@ -81,6 +86,8 @@ class GBM(RBM):
     def relation_logits(
         self, edges: Edges, v: Float[Tensor, "... B V"], h1: Float[Tensor, "... B H1"]
     ) -> Float[Tensor, "... B E"]:
+        """Return ℓ_t of all triples. It also depends on the presence of classes i and j."""
+        # The units are the same for all scenes, so `edges` has a single row.
         subject, object_ = v[..., edges.subject[0]], v[..., edges.object[0]]
         two_way = subject * self.g[:, 0] + object_ * self.g[:, 1]
         return super().relation_logits(edges, v, h1) + two_way

@@ -66,8 +66,8 @@ class Triway(BoltzmannMachine):
         self.M = nn.Parameter(torch.zeros(A, K, H1))
         self.P = nn.Parameter(torch.zeros(A, H1))
         self.n = nn.Parameter(torch.zeros(A, 2))
-        self.usual = nn.Parameter(torch.zeros(V))
-        self.residual = nn.Parameter(torch.zeros(spec.T))
+        self.usual = nn.Parameter(torch.zeros(V))  # mean log n_i, used if n_i is unknown
+        self.residual = nn.Parameter(torch.zeros(spec.T))  # w'
         if spec.G:
             self.gamma = nn.Parameter(torch.zeros(1 + spec.G, A, feature_count(A)))
             self.B = nn.Parameter(torch.zeros(spec.G, H1))
@@ -79,6 +79,7 @@ class Triway(BoltzmannMachine):
         by_unit: Float[Tensor, "T"],
         mean_log_counts: Float[Tensor, "V"],
     ) -> None:
+        """Set d to the log-odds of each relation, and `usual`. Single triples keep the weight 0."""
         self.d.copy_(by_relation)
         self.usual.copy_(mean_log_counts)
 
@@ -105,11 +106,13 @@ class Triway(BoltzmannMachine):
     def relation_logits(
         self, edges: Edges, v: Float[Tensor, "... B V"], h1: Float[Tensor, "... B H1"]
     ) -> Float[Tensor, "... B E"]:
+        """Return the logits ℓ_e of all relations between the n classes of each scene, flattened."""
         pairs = _pairs(edges)
+        # R[a,k] + M[a,k]·h1, so that one product over k gives both terms with S and O.
         shared = self.R + torch.einsum("akh,...bh->...bak", self.M, h1)
         left = embedding(pairs.classes, self.S).unsqueeze(-3) * shared.unsqueeze(-2)
         product = left.flatten(-3, -2) @ embedding(pairs.classes, self.O).mT
-        product = product.unflatten(-2, left.shape[-3:-1])
+        product = product.unflatten(-2, left.shape[-3:-1])  # (..., B, A, n, n)
         bias = self.d + h1 @ self.P.T
         # s[a,i] + n[a,0] log n_i of the subjects i, and o[a,j] + n[a,1] log n_j of the objects j.
         subject, object_ = (
@@ -118,7 +121,7 @@ class Triway(BoltzmannMachine):
         )
         pair_bias = (subject + bias.unsqueeze(-1)).unsqueeze(-1) + object_.unsqueeze(-2)
         logits: Tensor = product + pair_bias
-        if self.spec.T:
+        if self.spec.T:  # add the residual weights w' of the triples that have one
             keys = triple_keys(pairs.relation, pairs.subject, pairs.object, self.spec.V)
             position, exists = find_triples(self.triple_keys, keys)
             logits = logits + pairs.unflatten(self.residual[position] * exists)
@@ -127,6 +130,7 @@ class Triway(BoltzmannMachine):
     def implied(
         self, edges: Edges, observed: Float[Tensor, "B E"], h1: Float[Tensor, "B H1"]
     ) -> Float[Tensor, "B E"]:
+        """Return the changes x_e of the logits by observed relations r_G; 0 without rules."""
         if not self.spec.G:
             return super().implied(edges, observed, h1)
         return implied(self.gamma, self.B, _pairs(edges).unflatten(observed), h1).flatten(-3)
@@ -143,14 +147,18 @@ def _pairs(edges: Edges) -> PairEdges:
 
 
 def implication_features(observed: Float[Tensor, "B A n n"]) -> Float[Tensor, "B F n n"]:
-    """Return the features phi of relations that are observed to hold, over pairs of classes."""
+    """Return the features phi of relations that are observed to hold, over pairs of classes.
+
+    The F features are in the order of the module: 2A of pairs, (2A)² of paths and 4A degrees.
+    """
     n = observed.shape[-1]
     between = observed * ~torch.eye(n, dtype=torch.bool)
-    directed = torch.cat([between, between.mT], 1)
+    directed = torch.cat([between, between.mT], 1)  # the A relations in both directions
     kinds = directed.shape[1]
     # One batched product counts the paths of all relation pairs: (B, 2A·n, n) by (B, n, 2A·n).
     paths = directed.flatten(1, 2) @ directed.transpose(1, 2).flatten(2)
     paths = paths.view(len(observed), kinds, n, kinds, n).transpose(2, 3).flatten(1, 2).clamp(max=1)
+    # Degrees of the pair (i, j) leave out the relation between i and j itself.
     outgoing = directed.sum(-1, keepdim=True) - directed
     incoming = directed.sum(-2, keepdim=True) - directed
     degrees = torch.cat([outgoing, incoming], 1).clamp(max=_MOST)
@@ -165,7 +173,7 @@ def implied(
 ) -> Float[Tensor, "B A n n"]:
     """Return the changes x of the relation logits by observed relations, given means of h1."""
     A = observed.shape[1]
-    # The pair feature of relation a is r_e itself.
+    # The first A features are the pair features. That of relation a is r_e itself: weight 0.
     itself = torch.zeros(gamma.shape[1:], dtype=torch.bool)
     itself[:, :A].fill_diagonal_(True)
     gamma = gamma.masked_fill(itself, 0.0)

@@ -224,7 +224,7 @@ def ablate(
         names = [ablation.name for ablation in ablations]
         if unknown := sorted(set(row or ()) - set(names)):
             raise ConfigError(f"unknown rows {unknown}: choose from {', '.join(names)}")
-        configs = [full, *(one for one in ablations if not row or one.name in row)]
+        configs = [full, *(config for config in ablations if not row or config.name in row)]
         compare_machines(
             configs, data_folder(configuration, full, data), folder / full.name,
             PRIMARY, seeds=seeds, baselines=(), limit=limit, workers=workers, fresh=fresh,

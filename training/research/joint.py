@@ -82,13 +82,13 @@ def change_by_relations(
     states = torch.cat([torch.zeros_like(x[:, :1]), x], 1).softmax(1)
     drawn = torch.multinomial(states, draws, replacement=True, generator=generator).T
     one_hot = torch.nn.functional.one_hot(drawn, machine.spec.states)
-    h1 = one_hot[..., 1:].flatten(1).to(v.dtype)
+    h1 = one_hot[..., 1:].flatten(1).to(v.dtype)  # without the first state of each unit
     logits = machine.relation_logits(edges, v, h1.unsqueeze(1)).squeeze(1)
     is_unit = observed[0] & (machine.gate(edges, v)[0] > 0)
     log_p = (r[0] * logits - torch.nn.functional.softplus(logits))[:, is_unit].sum(1)
     weight = log_p.softmax(0)
-    raised = (h1 @ machine.W.T).exp()
-    return (weight @ raised).log() - raised.mean(0).log()
+    factors = (h1 @ machine.W.T).exp()  # exp(W_i h1) of each draw and class i
+    return (weight @ factors).log() - factors.mean(0).log()
 
 
 @torch.no_grad()
@@ -127,7 +127,7 @@ def compare_relations(
     related = with_relations(scenes)
     order = torch.randperm(len(related), generator=torch.Generator().manual_seed(0))
     generator = torch.Generator().manual_seed(0)
-    every, first = [], []
+    every, first = [], []  # mean change of all unlisted classes, and of the likeliest ones
     for k in order[:_LISTS]:
         batch = related.batch(k.unsqueeze(0))
         edges, r, observed = machine.lay_out(replace(batch, holds=batch.holds.double()))

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -30,6 +30,7 @@ from training.domain.terminal import StorePath
 from training.evaluation.asking import artifact_model
 from training.evaluation.report import read_test
 from training.evaluation.tasks import TASKS
+from training.fit.regression import recalibrated
 
 _LIMIT = 600
 
@@ -46,7 +47,7 @@ def at_a_place(**entries: float) -> Callable[[SceneModel], SceneModel]:
 
     def change(artifact: SceneModel) -> SceneModel:
         fits = tuple(fit.model_copy(update=entries) for fit in artifact.calibration.at)
-        return _recalibrated(artifact, at=fits)
+        return recalibrated(artifact, at=fits)
 
     return change
 
@@ -56,15 +57,11 @@ def misplaced(**entries: float) -> Callable[[SceneModel], SceneModel]:
 
     def change(artifact: SceneModel) -> SceneModel:
         original = artifact.calibration.misplaced
-        fits = {kind: getattr(original, kind) for kind in KINDS}
+        fits = {kind: getattr(original, kind) for kind in KINDS}  # None: not fitted
         update = {kind: fit and fit.model_copy(update=entries) for kind, fit in fits.items()}
-        return _recalibrated(artifact, misplaced=original.model_copy(update=update))
+        return recalibrated(artifact, misplaced=original.model_copy(update=update))
 
     return change
-
-
-def _recalibrated(artifact: SceneModel, **update: Any) -> SceneModel:
-    return replace(artifact, calibration=artifact.calibration.model_copy(update=update))
 
 
 def whole(artifact: SceneModel) -> SceneModel:

@@ -191,6 +191,7 @@ class Search:
         scores: dict[str, float] = {}
 
         def report(point: CurvePoint) -> None:
+            """Report the sum of the last scores to optuna, at a step from 0 to 200."""
             scores[SCORES[point.phase]] = point.score
             step = round(100 * point.done) + 100 * (point.phase == "relations")
             trial.report(float(np.nansum(list(scores.values()))), step)

@@ -107,6 +107,7 @@ class Lists:
             hides = self.hides[:, index]
             used = hides | ~self.shows[:, index]
             ranks, n = rankdata(scores[used, column])[hides[used]], int(hides.sum())
+            # The Mann-Whitney statistic, divided by the number of pairs of lists.
             values.append((ranks.sum() - n * (n + 1) / 2) / (n * (int(used.sum()) - n)))
         return np.array(values)
 
@@ -209,7 +210,7 @@ def measure(
     """Return the AUC of each left-out class by `METHODS`, and the MRR by `EVIDENCE`."""
     vocabulary, labels = reader.vocabulary, artifact.vocabulary.labels
     index_of = {label: index for index, label in enumerate(vocabulary.labels)}
-    own = np.array([index_of.get(label, -1) for label in labels])
+    own = np.array([index_of.get(label, -1) for label in labels])  # classes of `reader`, -1: none
     unseen = own[left_out][own[left_out] >= 0].tolist()
     words = [labels[index] for index in left_out.tolist()]
     new = [_word(*word, vocabulary, unseen) for word in zip(words, vectors, strict=True)]
@@ -219,7 +220,7 @@ def measure(
     nearest = np.array([word.nearest for word in new])
     of_words = log_odds(weights, listed, np.concatenate([columns, nearest]))
     trained = log_odds(artifact.weights, lists.listed, left_out)
-    length = np.repeat([[float(len(one))] for one in lists.listed], len(left_out), axis=1)
+    length = np.repeat([[float(len(x))] for x in lists.listed], len(left_out), axis=1)
     n = len(left_out)
     scores = (of_words[:, :n], of_words[:, n:], trained, length)
     auc = [lists.auc(values, left_out).tolist() for values in scores]
@@ -230,15 +231,15 @@ def measure(
         rest = [lists.listed[row][lists.listed[row] != index] for row in rows]
         without = [own[classes][own[classes] >= 0] for classes in rest]
         with_word, with_nearest = (
-            [np.union1d(classes, [one[k]]) for classes in without] for one in (columns, nearest)
+            [np.union1d(classes, [added[k]]) for classes in without] for added in (columns, nearest)
         )
-        for name, one, parts, targets in (
+        for name, machine, parts, targets in (
             ("predicted", weights, with_word, own[things]),
             ("nearest class", weights, with_nearest, own[things]),
             ("trained", artifact.weights, [lists.listed[row] for row in rows], things),
             ("left out", weights, without, own[things]),
         ):
-            mrr[name].append(lists.mrr(log_odds(one, parts, targets), rows, things))
+            mrr[name].append(lists.mrr(log_odds(machine, parts, targets), rows, things))
     return dict(zip(METHODS, auc, strict=True)), mrr
 
 

@@ -43,6 +43,7 @@ def own_or_shipped(path: Path | None, config: Config, kind: str, option: str) ->
 
 
 def read_toml(path: Path) -> dict[str, Any]:
+    """Return the content of a TOML file. Raise ConfigError if it is missing or invalid."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
@@ -116,6 +117,7 @@ def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
     values = config.model_dump()
     for name, value in settings.items():
         section, _, entry = name.partition(".")
+        # The fields of the section; none if the configuration has no section of this name.
         entries = getattr(type(getattr(config, section, None)), "model_fields", {})
         if entry not in entries:
             choice = f"{section} has {', '.join(entries)}" if entries else "name it section.entry"
@@ -149,6 +151,7 @@ def sections_toml(values: Mapping[str, Any], reasons: Mapping[str, str] | None =
 
 
 def _entry(name: str, value: Any) -> str:
+    """Return the TOML line of an entry, with a mapping as an inline table."""
     if isinstance(value, Mapping):
         entries = ", ".join(_entry(json.dumps(key), entry) for key, entry in value.items())
         return f"{name} = {{ {entries} }}"

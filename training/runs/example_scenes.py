@@ -135,7 +135,7 @@ def _make_example(
     frequency: Counter[int],
 ) -> Example:
     """Build a request from a scene, with the first object of each of the most frequent classes."""
-    first = dict(reversed(usable))
+    first = dict(reversed(usable))  # the first object of each class
     classes = sorted(first, key=lambda index: -frequency[index])[:_MOST_OBJECTS]
     kept = [(index, thing) for index, thing in usable if index in classes and first[index] is thing]
     names = {thing.id: vocabulary.labels[index] for index, thing in kept}

@@ -80,6 +80,7 @@ def save_run(
 def _write(
     folder: Path, config: Config, result: TrainingResult, data: Path | None, scenes: str
 ) -> None:
+    """Write the files of a run. `data` is the folder of its scenes, and `scenes` their digest."""
     machine = result.machine
     state = {name: tensor.contiguous() for name, tensor in machine.state_dict().items()}
     spec = json.dumps(machine.spec.to_dict())
@@ -127,6 +128,7 @@ def write_plot(path: Path, curve: Sequence[CurvePoint], title: str) -> None:
 
 
 def load_run(folder: Path) -> FinishedRun:
+    """Load a finished run. Raise RunError if files are missing, or of another release."""
     for name in ("config.json", "model.safetensors", "result.json"):
         if not (folder / name).is_file():
             runs = ", ".join(str(path.parent) for path in sorted(folder.glob("*/result.json")))

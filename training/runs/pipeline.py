@@ -113,6 +113,7 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
 
 
 def _path(source: str, root: Path) -> Path:
+    """Return the file of a data source. Files of public sources may be in the folder `extra`."""
     if source == inventories.SOURCE:
         return KNOWLEDGE / "inventories.csv"
     if is_file(source):
@@ -123,6 +124,7 @@ def _path(source: str, root: Path) -> Path:
 
 
 def _require_files(data: DataConfig, root: Path) -> None:
+    """Raise ConfigError if files of scenes are missing. It names them, and the remedy."""
     paths = {source: _path(source, root) for source in data.sources if source != "rooms"}
     missing = {source: path for source, path in paths.items() if not path.is_file()}
     if not missing:

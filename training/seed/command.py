@@ -84,10 +84,12 @@ def seed(
         raise typer.Exit(130) from None
     results: dict[str, Any] = {}
     for split, machines in runs.items():
-        m = materials[split]
-        answers = {"frequency": frequency_answer(m.triples, m.train), "nothing": nothing_answer}
+        material = materials[split]
+        triples, test = material.triples, material.test
+        frequency = frequency_answer(triples, material.train)
+        answers = {"frequency": frequency, "nothing": nothing_answer}
         references = {
-            name: [measure(answer, m.triples, m.test, k) for k in range(seeds)]
+            name: [measure(answer, triples, test, number) for number in range(seeds)]
             for name, answer in answers.items()
         }
         results[split] = {"references": references, "machines": machines}
@@ -178,11 +180,11 @@ def markdown(source: str, materials: Mapping[str, Material], results: Mapping[st
     """Return the page with a table for each split. Cells are means ± standard deviations."""
     parts = [f"# Bozcan et al. (2018) on {source}\n", "![errors E by epoch](errors.png)\n"]
     for split, result in results.items():
-        m = materials[split]
+        material = materials[split]
         parts.append(
-            f"## {_TITLES[split]}\n\nScenes: {len(m.train)} for training, {len(m.validation)} for "
-            f"validation, {len(m.test)} for tests. {len(m.vocabulary)} classes, {len(m.triples)} "
-            "triples.\n"
+            f"## {_TITLES[split]}\n\nScenes: {len(material.train)} for training, "
+            f"{len(material.validation)} for validation, {len(material.test)} for tests. "
+            f"{len(material.vocabulary)} classes, {len(material.triples)} triples.\n"
         )
         parts.append(_table(result))
         for name, runs in result["machines"].items():
@@ -193,6 +195,7 @@ def markdown(source: str, materials: Mapping[str, Material], results: Mapping[st
 
 
 def _table(result: Mapping[str, Any]) -> str:
+    """Return the Markdown table of a split: a row for each metric, a column for each machine."""
     columns: dict[str, list[Row]] = dict(result["references"])
     columns |= {name: [_row(run) for run in runs] for name, runs in result["machines"].items()}
     metrics = dict.fromkeys(metric for rows in columns.values() for row in rows for metric in row)
@@ -220,6 +223,7 @@ def _row(run: Run) -> Row:
 
 
 def _cells(metric: str, columns: Iterable[list[Row]]) -> Iterator[str]:
+    """Yield mean ± standard deviation over the seeds of each column; "" without the metric."""
     for rows in columns:
         values = [row[metric] for row in rows if metric in row]
         digits = 0 if metric in ("epochs", "weights") else 1 if metric.startswith("E ") else 3

@@ -97,6 +97,7 @@ class Machine(nn.Module):
     def __init__(
         self, triples: Int[Tensor, "T 3"], V: int, H1: int, H2: int, generator: torch.Generator
     ) -> None:
+        """Draw small random weight matrices. Biases start at 0; the T triples are the relations."""
         super().__init__()
         T = len(triples)
         self.subject, self.object = triples[:, 1], triples[:, 2]
@@ -201,6 +202,7 @@ class GBM(Machine):
         self.g = _fixed(_SCALE * torch.randn((2, len(triples)), generator=generator))
 
     def add_products(self, state: State, step: float) -> None:
+        """Also add to g: -dE/dg is the relation times the presence of its subject or object."""
         super().add_products(state, step)
         for g, presence in zip(self.g, self.presence(state.v), strict=True):
             g.add_((state.r * presence).sum(0), alpha=step)
@@ -225,9 +227,10 @@ class Triway(GatedRBM):
     """Tri-way edges r_e v_i v_j: a relation also acts on its objects."""
 
     def relation_field(self, state: State) -> Objects:
+        """Add the logit of each relation that is on to each object whose partner is present."""
         logits = state.r * self.relation_logits(state.v, state.h1)
         subject, object_ = self.presence(state.v)
-        same = self.subject == self.object  # v_i v_i = v_i
+        same = self.subject == self.object  # v_i v_i = v_i: such a triple counts once, without gate
         return self.sum_by_class(
             logits * object_.masked_fill(same, 1.0), logits * subject.masked_fill(same, 0.0)
         )
@@ -277,6 +280,7 @@ def phases(
     machine: Machine, scenes: Scenes, generator: torch.Generator, steps: int = 1
 ) -> tuple[State, State, Float[Tensor, "B"], Float[Tensor, "B"]]:
     """Run both phases. Return their last states, and the errors E of objects and of relations."""
+    # `start` is the positive phase, which has the scenes; `state` becomes the negative phase.
     v, r, free = scenes.v, scenes.r, Free.of(scenes.v, scenes.annotated, scenes.r)
     start = state = State(v, r, *machine.hidden(v, r, generator))
     object_p, relation_p = v, r
@@ -292,6 +296,7 @@ def phases(
 
 def _with_context(machine: Machine, state: State, draws: Sequence[Tensor]) -> State:
     """Sample h1 and h2 with these random numbers. Return the state with the mean of h1 given h2."""
+    # The effect of v and r on h1. That of h2 is added below, first from its old value.
     visible = machine.h1_logits(state.v, state.r, torch.zeros_like(state.h2))
     h1 = (draws[0] < (visible + state.h2 @ machine.J.T).sigmoid()).to(visible.dtype)
     h2 = (draws[1] < machine.h2_logits(h1).sigmoid()).to(visible.dtype)
@@ -322,29 +327,31 @@ def train(
 
 
 def _epoch(machine: Machine, material: Material, generator: torch.Generator, rate: float) -> Epoch:
-    start, own = time.perf_counter(), []
+    """Update the weights once by each batch of training scenes, and return the errors."""
+    start, batch_errors = time.perf_counter(), []
     for index in torch.randperm(len(material.train), generator=generator).split(BATCH):
         positive, negative, *error = phases(machine, material.train.rows(index), generator)
         machine.update(positive, negative, rate)
-        own.append(error)
-    seconds = time.perf_counter() - start
+        batch_errors.append(error)
+    seconds = time.perf_counter() - start  # of the training alone
     validation = errors(machine, material.validation, generator)
-    return Epoch(*_averages(own, material.train), *validation, seconds)
+    return Epoch(*_averages(batch_errors, material.train), *validation, seconds)
 
 
 def errors(machine: Machine, scenes: Scenes, generator: torch.Generator) -> tuple[float, float]:
     """Return the error E of objects and of relations, averaged over scenes."""
     batches = torch.arange(len(scenes)).split(BATCH)
-    own = [phases(machine, scenes.rows(index), generator)[2:] for index in batches]
-    return _averages(own, scenes)
+    batch_errors = [phases(machine, scenes.rows(index), generator)[2:] for index in batches]
+    return _averages(batch_errors, scenes)
 
 
-def _averages(own: Sequence[Sequence[Tensor]], scenes: Scenes) -> tuple[float, float]:
-    objects, relations = (float(torch.cat(error).sum()) for error in zip(*own, strict=True))
+def _averages(batches: Sequence[Sequence[Tensor]], scenes: Scenes) -> tuple[float, float]:
+    objects, relations = (float(torch.cat(error).sum()) for error in zip(*batches, strict=True))
     return objects / len(scenes), relations / max(int(scenes.annotated.sum()), 1)
 
 
 def _check(machine: Machine, epoch: int, rate: float) -> None:
+    """Raise FloatingPointError if a weight is NaN or above `LARGEST_WEIGHT`."""
     for name, weight in machine.named_parameters():
         largest = float(weight.abs().max()) if weight.numel() else 0.0
         if not largest <= LARGEST_WEIGHT:  # also true for NaN

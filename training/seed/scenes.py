@@ -101,6 +101,7 @@ def _material(
     sha = hashlib.sha256(repr([entry.label for entry in vocabulary.objects]).encode())
     for entry in parts.items():
         sha.update(repr(entry).encode())
+    # The inverse of `_keys`: relation, subject and object class of each unit.
     triples = np.stack([units // V // V, units // V % V, units % V], axis=1)
     return Material(vocabulary, torch.from_numpy(triples), **tensors, digest=sha.hexdigest())
 
@@ -113,6 +114,7 @@ def _keys(scene: EncodedScene, V: int) -> Int[NDArray, "n"]:
 
 
 def _scenes(scenes: Sequence[EncodedScene], units: Int[NDArray, "T"], V: int) -> Scenes:
+    """Return the scenes as tensors. `units` are the keys (`_keys`) of the triples with a unit."""
     v, r = torch.zeros(len(scenes), V), torch.zeros(len(scenes), len(units))
     keys = [_keys(scene, V) for scene in scenes]
     for row, (scene, own) in enumerate(zip(scenes, keys, strict=True)):

@@ -211,7 +211,7 @@ def _supporters(
         if len(of_object):
             yield i, int(classes[i]), of_object
         elif observed.has_boxes or supports[i].any():
-            yield i, int(classes[i]), np.array([len(structure)])
+            yield i, int(classes[i]), np.array([len(structure)])  # the supporter "nothing"
 
 
 def supporter_table(
@@ -269,8 +269,8 @@ class _RoomCounts(NamedTuple):
     def table(
         self, alpha: float, exponent: float, absent: bool
     ) -> tuple[Float[Tensor, " C"], Float[Tensor, "C V"]]:
-        """Return the bias of each room type and the weights of the classes."""
-        average = (self.present.sum(0) + 0.5) / (self.labelled.sum(0) + 1.0)
+        """Return biases and weights of naive Bayes; with `absent`, absent classes are evidence."""
+        average = (self.present.sum(0) + 0.5) / (self.labelled.sum(0) + 1.0)  # p(j)
         p = (self.present + alpha * average) / (self.labelled + alpha)
         prior = ((self.scenes + 0.5) / (self.scenes + 0.5).sum()).log()
         without = torch.log1p(-p) * absent
@@ -299,8 +299,8 @@ def _room_counts(
         room, source = scenes.room[lists.index], scenes.source[lists.index]
         counts = {"": _RoomCounts.of(lists, room, types)}
         for k in source.unique().tolist():
-            part = Lists(*(values[source == k] for values in vars(lists).values()))
-            counts[scenes.source_names[k]] = _RoomCounts.of(part, room[source == k], types)
+            own = Lists(*(values[source == k] for values in vars(lists).values()))
+            counts[scenes.source_names[k]] = _RoomCounts.of(own, room[source == k], types)
         yield name, counts
 
 

@@ -69,7 +69,7 @@ _SHARPNESS = (4.0, 8.0, 12.0)
 
 
 def nearest_score(lists: Lists, *, neighbours: int, sharpness: float) -> ObjectScore:
-    """Return a score function from presence to log-odds."""
+    """Return a score function from the presence of classes to kNN log-odds of all classes."""
     popularity, v = lists.frequency(), lists.filled()
     index = normalize(lists.v, dim=1).T.contiguous()
 
@@ -123,7 +123,7 @@ def fit_pairwise(
     labelled, pattern = lists.labelled.unique(dim=0, return_inverse=True)
     unlabelled = ~labelled * lists.frequency()
     bias = start.bias.clone().requires_grad_()
-    half = (start.weights / 2).requires_grad_()
+    half = (start.weights / 2).requires_grad_()  # W is this matrix plus its transpose
     optimiser = torch.optim.LBFGS(
         [bias, half], max_iter=iterations, history_size=10, line_search_fn="strong_wolfe"
     )
@@ -137,6 +137,7 @@ def fit_pairwise(
         W = symmetric()
         logits = bias + torch.sparse.mm(sparse, W) + (unlabelled @ W)[pattern]
         misfit = binary_cross_entropy_with_logits(logits, v, weight, reduction="sum")
+        # The sum has each pair twice, hence l2 / 4.
         total = (misfit + l2 / 4 * W.square().sum()) / len(v)
         total.backward()
         return total
@@ -298,7 +299,7 @@ def train_network(
     for step in range(1, steps + 1):
         # Dropout uses the global random generator. The fork restores its state after the block.
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed * 1_000_003 + step)
+            torch.manual_seed(seed * 1_000_003 + step)  # differs for each seed and step
             network.train()
             index = weight.multinomial(_BATCH, replacement=True)
             optimiser.zero_grad()
@@ -315,10 +316,11 @@ def draw_lists(v: Float[Tensor, "B V"]) -> Float[Tensor, "B V"]:
     """Return random parts of scenes with at least two classes."""
     classes = v.sum(1)
     share = _LEAST_SHARE + (1 - _LEAST_SHARE) * torch.rand(len(v))
-    listed = torch.where(torch.rand(len(v)) < _ONE_HIDDEN, classes - 1, (share * classes).round())
-    listed = listed.clamp(min=1).minimum(classes - 1)
+    count = torch.where(torch.rand(len(v)) < _ONE_HIDDEN, classes - 1, (share * classes).round())
+    count = count.clamp(min=1).minimum(classes - 1)
+    # A random order of the classes, in which the absent ones come last.
     rank = torch.rand(v.shape).masked_fill(v == 0, 2.0).argsort(1).argsort(1)
-    return v * (rank < listed.unsqueeze(1))
+    return v * (rank < count.unsqueeze(1))
 
 
 def hidden_loss(
@@ -333,8 +335,8 @@ def hidden_loss(
     candidate, hidden = (listed == 0) & labelled, v - listed
     logits = network(listed)
     if loss == "binary":
-        each = binary_cross_entropy_with_logits(logits, hidden, reduction="none")
-        return (each * candidate).sum() / len(v)
+        of_class = binary_cross_entropy_with_logits(logits, hidden, reduction="none")
+        return (of_class * candidate).sum() / len(v)
     log_p = logits.masked_fill(~candidate, -torch.inf).log_softmax(1)
     return -(log_p.masked_fill(hidden == 0, 0.0).sum(1) / hidden.sum(1)).mean()
 
@@ -371,7 +373,7 @@ def autoencoder(train: SceneTensors, structure: Structure, seed: int) -> Proposa
     lists = dict(training_lists(train, structure))
 
     def fit(setting: dict[str, Any], share: float) -> Iterator[tuple[Parameters, ObjectScore]]:
-        options = setting.copy()
+        options = setting.copy()  # `train_network` gets the options that remain
         chosen = lists[options.pop("scenes")]
         sizes = {name: options.pop(name) for name in ("width", "dropout")}
         with torch.random.fork_rng(devices=[]):
