@@ -269,6 +269,17 @@ class BoltzmannMachine(nn.Module, ABC):
         del edges, h1
         return torch.zeros_like(observed)
 
+    def relation_term(
+        self,
+        edges: Edges,
+        v: Float[Tensor, "... B V"],
+        r: Float[Tensor, "... B E"],
+        h1: Float[Tensor, "... B H1"],
+    ) -> Float[Tensor, "... B"]:
+        """Return sum_e g_e (r_e ℓ_e - log(1 + exp ℓ_e)) = log p(r | v, h1)."""
+        logits = self.relation_logits(edges, v, h1)
+        return ((r * logits - softplus(logits)) * self.gate(edges, v)).sum(-1)
+
     def energy(
         self,
         v: Float[Tensor, "B V"],
@@ -285,10 +296,8 @@ class BoltzmannMachine(nn.Module, ABC):
             log_weight = log_weight + 0.5 * ((v @ couplings) * v).sum(-1)
             log_weight = log_weight + (v * self.room_bias(room)).sum(-1)
         log_weight = log_weight + self.room_rate(room, source)
-        logits, gate = self.relation_logits(edges, v, h1), self.gate(edges, v)
-        # sum_e g_e (r_e ℓ_e - log(1 + exp ℓ_e)) = log p(r | v, h1)
-        energy = -log_weight - ((r * logits - softplus(logits)) * gate).sum(-1)
-        return torch.where((r > gate).any(-1), torch.inf, energy)
+        energy = -log_weight - self.relation_term(edges, v, r, h1)
+        return torch.where((r > self.gate(edges, v)).any(-1), torch.inf, energy)
 
 
 def sparse_product(v: Float[Tensor, "B V"], weights: Float[Tensor, "V k"]) -> Float[Tensor, "B k"]:
