@@ -185,7 +185,8 @@ def _readings(label: str) -> Iterator[tuple[Rule, str]]:
     """Yield the readings by one rule, then those by a second rule on the first readings."""
     pairs = _by_one_rule(label)
     yield from pairs
-    parts = [pair for pair in pairs if pair[1] in label]  # without combinations of parts
+    # Not "coffee table" of "table (coffee)", which joins two parts of the label.
+    parts = [pair for pair in pairs if pair[1] in label]
     for first, name in parts[:_MOST_READ_AGAIN]:
         for rule, inner in _by_one_rule(name):
             if rule != first:

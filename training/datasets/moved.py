@@ -213,6 +213,7 @@ def _moves(boxes: _Boxes, rng: Rng) -> Iterator[tuple[Bool[NDArray, "n n"], _Pla
     A moved instance is lifted onto another one, put on the floor, or under its support.
     """
     usable, area, bottom, height = boxes.usable, boxes.area, boxes.bottom, boxes.size[:, 2]
+    # In each mask, row i is the moved instance, and column j is the other one.
     smaller = usable[:, None] & usable & (area[:, None] < area)
     supported = boxes.supports & smaller
     fits = boxes.strange & (area[:, None] <= area)
@@ -225,6 +226,7 @@ def _moves(boxes: _Boxes, rng: Rng) -> Iterator[tuple[Bool[NDArray, "n n"], _Pla
     ]
     kinds = [kinds[k] for k in rng.permutation(len(kinds)).tolist()]
     on_floor = (bottom <= boxes.floor + CONTACT) & ~boxes.supports.any(1)
+    # A stranger high and large enough that nobody would call it a place for the object.
     carries = boxes.strange & (height >= _LEAST_STEP) & (_LEAST_AREA * area[:, None] <= area)
     lifted = carries & on_floor[:, None], _onto
     # Objects of the floor are lifted first with the probability `_LIFTED`, otherwise last.

@@ -92,7 +92,10 @@ def with_things(vocabulary: Vocabulary, things: Mapping[str, Thing]) -> Vocabula
 
 
 def _ancestors(label: str | None, parents: Mapping[str, str | None]) -> set[str]:
-    """Return a class and its broader classes: a class below them must not become a parent."""
+    """Return a class and its broader classes, or nothing without a class.
+
+    A class must not become the child of a class that has it among its ancestors: a circle.
+    """
     ancestors: set[str] = set()
     while label is not None:
         ancestors.add(label)

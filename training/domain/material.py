@@ -62,6 +62,8 @@ class Material:
 def read_material(paths: Iterable[Path], *, recorded: bool = False) -> Material:
     """Read files of scenes and inventories. With `recorded`, every file of scenes is JSONL.
 
+    The result also counts the labels that name no kind of object, such as "item".
+
     Raises:
         DatasetError: a file cannot be read, or has no scene.
         InvalidLinesError: lines of a file are invalid.

@@ -171,8 +171,8 @@ class Ratio(Metric):
         cls, values: Shaped[NDArray, " G"], mask: Bool[NDArray, " G"] | None = None
     ) -> Ratio:
         """Return the mean of values over the scenes in `mask`, by default all."""
-        below = np.ones(len(values)) if mask is None else mask.astype(np.float64)
-        return cls(values.astype(np.float64), below)
+        counted = np.ones(len(values), np.bool_) if mask is None else mask
+        return cls(np.where(counted, values, 0.0), counted.astype(np.float64))
 
     @property
     def n(self) -> int:  # type: ignore[override]

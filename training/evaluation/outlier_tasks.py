@@ -222,7 +222,11 @@ def intruder_weights(
 def draw_intruder_choices(
     scenes: SceneTensors, structure: Structure, train: SceneTensors | None, seed: int = 0
 ) -> dict[tuple[str, str], Int[NDArray, " choices"]]:
-    """Draw an intruder of each law for each scene, by (source, scene id), for `ask_outliers`."""
+    """Draw an intruder of each law for each scene, by (source, scene id), for `ask_outliers`.
+
+    A value has the class of the intruder of each law, without the laws that found none. Without
+    `train`, the only law is uniform.
+    """
     weights = intruder_weights(scenes, train).values()
     # `ask_outliers` uses `seed` itself. Another seed keeps the draws independent.
     columns = [draw_intruders(scenes, structure, weight, seed + 1) for weight in weights]

@@ -302,7 +302,10 @@ class Case(NamedTuple):
 def evidence_cases(
     scenes: SceneTensors, structure: Bool[NDArray, " V"], kind: str, seed: int = 0
 ) -> Iterator[Case]:
-    """Generate the T1 questions: evidence about half of the classes, all other pairs queried."""
+    """Generate the T1 questions: evidence about half of the classes, all other pairs queried.
+
+    If `kind` is "poses", boxes show the evidence; otherwise the request states it.
+    """
     for index, encoded in enumerate(scenes.scenes):
         instances, classes = encoded.instance_classes, encoded.evidence.classes
         things = classes[~structure[classes]]
@@ -321,7 +324,8 @@ def evidence_cases(
         scene = replace(scene_of(encoded, range(len(instances)), triples), room_type=None)
         if kind == "poses":
             observed = encoded.instance_observed & between
-            table = RelationTable.shown_by_boxes(evidence, observed, np.zeros_like(observed))
+            excluded = np.zeros_like(observed)  # the boxes exclude nothing about queried pairs
+            table = RelationTable.shown_by_boxes(evidence, observed, excluded)
             scene = replace(scene, relations=table)
         yield Case(index, scene, queried, truth)
 

@@ -48,7 +48,7 @@ _SCENES = 1500
 _LISTED = 20  # relations that an answer of the service lists by default
 _MOST_OF_A_PART = 8  # classes of a part of a scene
 _POSSIBLE = -3.5  # least log-odds of a relation that may well hold
-_OF_THE_REST = 0.02
+_OF_THE_REST = 0.02  # weight of the examples that are not listed
 _ROUNDS = 3
 _UNKNOWN = -1.0  # truth of an example whose data source does not annotate the relation
 # Objects removed from each scene in turn: with one, the fit depends too much on chance.
@@ -260,11 +260,14 @@ def _fit_possible(examples: _Examples) -> tuple[CountSlope, ...]:
 
 
 def _fit_listed(examples: _Examples, listed: int) -> tuple[CountSlope, ...]:
-    """Fit the slopes, mainly to the `listed` likeliest examples of a scene, as an answer does."""
+    """Fit the slope of each relation, mainly to the `listed` likeliest examples of a scene.
+
+    An answer shows these examples only.
+    """
     annotated = examples.annotated
     fitted = examples.rows(annotated)
     slopes = _fit_by_kind(fitted, np.ones(len(fitted)))
-    # Selection by log-odds also selects errors, so the ranking changes the fit.
+    # The slopes decide which examples are listed, and the listed examples decide the slopes.
     for _ in range(_ROUNDS):
         is_listed = _is_listed(examples, slopes, listed)[annotated]
         weight = np.where(is_listed, 1.0, _OF_THE_REST)

@@ -78,10 +78,11 @@ def place_terms(artifact: SceneModel, question: PlaceQuestion) -> PlaceTerms:
 
 
 def fit_place(sources: Sequence[Sequence[PlaceTerms]]) -> PlaceFit:
-    """Fit log P(at the place) = log P(present) + log σ(a + b·relation + c·counts), see `PlaceFit`.
+    """Fit log P(at the place) = log P(present) + log σ(a + b·relation + c·counts).
 
-    The penalised likelihood is maximal. A source has one group of terms for each question, and all
-    sources have equal weight.
+    `relation` is the log-probability of the relation by the machine. `counts` is the log of how
+    much more often training shows the class at the place than elsewhere. The penalised likelihood is
+    maximal. A source has one group of terms for each question, and all sources have equal weight.
     """
     columns = [map(np.concatenate, zip(*terms, strict=True)) for terms in sources]
     if not columns:
@@ -103,6 +104,7 @@ def fit_place(sources: Sequence[Sequence[PlaceTerms]]) -> PlaceFit:
         likelihood = weight @ np.where(is_there, log_p, log_not)
         return float(_PENALTY * a**2 - likelihood / len(sources))
 
+    # More evidence never lowers the probability, so b and c are not negative.
     limits = [(None, None), (0, 1.5), (0, 1.5)]
     best = minimize(loss, [0.0, 0.5, 0.3], bounds=limits).x.tolist()
     return PlaceFit(intercept=best[0], relation=best[1], counts=best[2])
