@@ -289,6 +289,7 @@ class SharedUnits(RelationUnits):
         B, (R, r, _) = len(means), Y.shape
         # cov(h1) is diag(m) - m m' within each hidden unit, and 0 between units. C is the lower
         # half of F diag(m) F', and f is F m of each unit. `_shared_moments` subtracts f f' from C.
+        # U has the coefficients (B, R, k) of z in the mean logits.
         U, C = (
             (means @ columns[:, chosen].reshape(len(columns), -1)).reshape(B, R, -1)
             for columns in (self._GT, self._FF)

@@ -62,11 +62,11 @@ class Heights:
 def stands_of(
     holds: Bool[NDArray, "A n n"], observed: Bool[NDArray, "A n n"], heights: Heights, floor: float
 ) -> Int[NDArray, " n"]:
-    """Return the stand of each of n boxes.
+    """Return the stand of each of n boxes, by relations a(i, j) that hold and that are observed.
 
-    A low object stands on the floor, also if it is on a rug. The value is `UNKNOWN` if a bottom or
-    the floor (in metres, or NaN) is unknown, if a box reaches into another box and its relation to
-    this box is open, or if a box is closely above another box.
+    A low object stands on the floor, also if it is on a rug. The value is `UNKNOWN` if a bottom is
+    unknown, if on-top or inside is not observed (box i reaches into box j), or if a box is closely
+    above another box. Without a floor (in metres, or NaN), only `SUPPORTED` is known.
     """
     bottoms, tops, has_floor = heights.bottoms, heights.tops, not math.isnan(floor)
     is_known = np.isfinite(bottoms)

@@ -91,7 +91,10 @@ def _plain(name: str) -> str:
 
 
 def _by_any_name(table: dict[str, tuple[str, ...]]) -> dict[str, str]:
-    """Map the key of each name in a table, except "", to the name whose entry contains it."""
+    """Map the key of each name in a table to the name whose entry contains it.
+
+    The entry "" has names that say nothing, such as "unknown"; they map to "".
+    """
     return {
         label_key(other): name
         for name, others in table.items()
@@ -222,7 +225,8 @@ def source_vocabulary(
     spellings = dict.fromkeys((*names.base, *names.household, *names.structure), ())
     aliases = spellings | names.aliases
     base = tuple({label_key(name): name for name in map(names.canonical, required)}.values())
-    # Without kinds, a specific name becomes an alias: "coffee table" of "table".
+    # Without kinds, a specific name becomes an alias: "coffee table" of "table". `_with_kinds` adds
+    # the curated specific names that no class has.
     mentioned_only = replace(names, base=base, household=(), kinds={}, aliases=aliases)
     return _with_kinds(build_vocabulary(scenes, mentioned_only, minimum=minimum))
 

@@ -93,7 +93,10 @@ def rank_missing(
 
 
 def missing_task(score: ObjectScore, setting: Setting) -> Outcome | None:
-    """Measure T2, without structure and with the structure of the scene."""
+    """Measure T2, without structure and with the structure of the scene.
+
+    The result is None if no scene has a class to hide.
+    """
     scenes, structure = setting.some(), setting.structure
     metrics: dict[str, Metric] = {}
     skipped = 0
@@ -102,7 +105,7 @@ def missing_task(score: ObjectScore, setting: Setting) -> Outcome | None:
         if not len(ranking.target):
             return None
         metrics[f"MRR, {name}"] = ranking.mrr()
-        parts = draw_parts(scenes, structure, size, SEEDS)
+        parts = draw_parts(scenes, structure, size, SEEDS)  # those of `rank_missing`
         skipped = parts.skipped
         row, target = parts.hidden.nonzero(as_tuple=True)
         is_related = parts.related[row, target].numpy()

@@ -198,7 +198,8 @@ class _Fit:
 
 
 _RARE: Final = 0.1  # quantile of the old biases that a new class or room type gets
-# Arrays whose new entries are the mean of the old ones.
+# Arrays whose new entries are the mean of the old ones: changes of biases by listed share and in
+# whole scenes, and log numbers of instances. Their typical value is not 0.
 _AVERAGED: Final = ("kappa", "u", "usual")
 
 

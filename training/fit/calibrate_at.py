@@ -81,8 +81,8 @@ def fit_place(sources: Sequence[Sequence[PlaceTerms]]) -> PlaceFit:
     """Fit log P(at the place) = log P(present) + log σ(a + b·relation + c·counts).
 
     `relation` is the log-probability of the relation by the machine. `counts` is the log of how
-    much more often training shows the class at the place than elsewhere. The penalised likelihood is
-    maximal. A source has one group of terms for each question, and all sources have equal weight.
+    much more often training shows the class at the place than elsewhere. The penalised likelihood
+    is maximal. A source has a group of terms for each question. All sources have equal weight.
     """
     columns = [map(np.concatenate, zip(*terms, strict=True)) for terms in sources]
     if not columns:

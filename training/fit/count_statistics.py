@@ -73,7 +73,7 @@ def _fit(cases: _Cases, most: Int[NDArray, "V"], vocabulary: Vocabulary) -> Coun
     """Fit the statistics of the classes whose maximum listed number `most` is above 0."""
     log_frequency = _log_frequencies(cases, len(vocabulary))
     weights = _weights(cases, log_frequency, most > 0)
-    # The exponent -1 stands for the listed number, which is uniform from 1 to n.
+    # A listed number is uniform from 1 to n: its probability 1/n adds -1 to the exponent 0, of n.
     weights[:, 0, INTERCEPT] -= 1.0
     # A class is no feature of its own number.
     itself = ROOM + len(vocabulary.room_types) + np.arange(len(vocabulary))

@@ -16,8 +16,9 @@ Given the objects, the log-odds of an unlisted class i have a closed form:
 
     log-odds_i = b_i + a_qi + Y_ti + (vL)_i + sum_m log sum_z p_m(z | v, t) exp(W_i[m, z])
 
-If the source is unknown, a_qi is replaced by its mean over the sources given the listed classes,
-with the probabilities p(q | v) = softmax(f + a v). A room type has the probability
+In lists of a known share of the classes of a scene, kappa_i of this share is added. u_qi belongs to
+whole scenes only. If the source is unknown, a_qi is replaced by its mean over the sources given the
+listed classes, with the probabilities p(q | v) = softmax(f + a v). A room type has the probability
 
     p(t | v) = sum_q p(q | v) softmax_t(e + y_q + Y v + sum_m log sum_z p_m(z | v) exp(Q_t[m, z]))
 
