@@ -101,10 +101,10 @@ def placements(
     if A > INSIDE:
         sizes = model.vocabulary.sizes
         has_sizes = any(thing.size is not None for thing in things)
-        inner = sizes[candidates]
-        outer = boxes_of(things, sizes)[1] if has_sizes else sizes[classes]
-        forward[:, INSIDE][do_not_fit(inner, outer)] = NO_UNIT
-        backward[:, INSIDE][do_not_fit(outer, inner).T] = NO_UNIT
+        of_things = boxes_of(things, sizes)[1] if has_sizes else sizes[classes]
+        candidates_too_large, things_too_large = do_not_fit(sizes[candidates], of_things)
+        forward[:, INSIDE][candidates_too_large] = NO_UNIT
+        backward[:, INSIDE][things_too_large] = NO_UNIT
     slopes, log_counts = model.relation_slopes.placement, present.log_counts[anchors]
     rows, relations, outgoing, columns, p = _likeliest_places(
         slopes, forward, backward, log_counts, PLACES, first, LEAST_SHARE, LEAST_LIKELY

@@ -364,16 +364,17 @@ def _names_to_guess(label: str) -> list[str]:
 
 
 def do_not_fit(
-    inner: Float[NDArray[np.float64], "N 3"], outer: Float[NDArray[np.float64], "m 3"]
-) -> Bool[NDArray[np.bool_], "N m"]:
-    """Return which boxes do not fit into which other boxes.
+    sizes: Float[NDArray[np.float64], "N 3"], others: Float[NDArray[np.float64], "m 3"]
+) -> tuple[Bool[NDArray[np.bool_], "N m"], Bool[NDArray[np.bool_], "N m"]]:
+    """Return which of N boxes do not fit into which of m boxes, and which of the m into the N.
 
     A box fits into another box if each of its extents, in order of size, is at most `_TIGHT` times
     that of the other. A box of unknown size (NaN) fits everywhere.
     """
-    sides, limits = np.sort(inner, axis=1), _TIGHT * np.sort(outer, axis=1)
+    sides, other_sides = np.sort(sizes, axis=1)[:, None], np.sort(others, axis=1)
     # A comparison with NaN is False.
-    return np.logical_or.reduce([sides[:, None, k] > limits[:, k] for k in range(3)])
+    larger = sides > _TIGHT * other_sides, other_sides > _TIGHT * sides
+    return np.any(larger[0], axis=2), np.any(larger[1], axis=2)
 
 
 def _tables(
