@@ -74,6 +74,7 @@ def _state_whole_numbers(node: Any) -> None:
         if node.get("type") == "integer":
             for bound in ("minimum", "maximum"):
                 if bound in node:
+                    # As a float, MAX_SEED is rounded up.
                     node[bound] = min(int(node[bound]), MAX_SEED)
         for value in node.values():
             _state_whole_numbers(value)

@@ -193,7 +193,7 @@ class ConditionedChains:
         return self._in_room(room)._continued(on, steps, stream)
 
     def _continued(self, on: Bits, steps: int, stream: np.random.Generator) -> ChainState:
-        """Return the state of a chain after ``steps`` sweeps from the classes ``on``."""
+        """Return the state of a chain after ``steps`` sweeps, which change the classes ``on``."""
         h1 = self.sweep(on, steps, stream)
         classes = np.flatnonzero(on)
         logits = self._logits(classes, h1)

@@ -86,7 +86,7 @@ def reasons(
 def significant(numbers: Float[NDArray[np.floating[Any]], "n"]) -> list[float]:
     """Round numbers to `DIGITS` significant digits."""
     values = numbers.astype(np.float64)
-    exact = _round_to_digits(values)
+    exact = _round_to_digits(values)  # in place, except very small and very large numbers
     rounded: list[float] = values.tolist()
     return rounded if exact else [rounded_number(value) for value in rounded]
 
@@ -97,12 +97,15 @@ def rounded_number(number: float) -> float:
 
 
 def written_within(answer: Fields, most: int) -> bytes | None:
-    """Return an answer as JSON, or None above ``most`` bytes, measured in parts."""
+    """Return an answer as JSON, or None above ``most`` bytes.
+
+    Parts are written first, so that an answer far too large never exists as a whole.
+    """
     size = 0
     for entries in answer.values():
         if isinstance(entries, list) and len(entries) > _PART:
             for start in range(0, len(entries), _PART):
-                size += len(written(entries[start : start + _PART]))
+                size += len(written(entries[start : start + _PART])) - 1  # brackets, no comma
                 if size > most:
                     return None
     body = written(answer)
@@ -130,7 +133,9 @@ def written(answer: Any) -> bytes:
 
 @compiled
 def _strongest(
-    change: Float[NDArray, "N n"], rows: Int[NDArray, " N"], count: int
+    change: Float[NDArray, "N n"],  # of the log-odds of each explained class by each class
+    rows: Int[NDArray, " N"],
+    count: int,
 ) -> tuple[Int[NDArray, "N k"], Float[NDArray, "N k"]]:
     """Return the indices and values of the k <= `count` largest absolute changes by other classes.
 

@@ -51,7 +51,10 @@ class Candidate:
         return None if self.scene_model is None else self.scene_model.vocabulary
 
     def model(self, scenes: Vocabulary, data: TrainingData, say: Progress) -> Model:
-        """Return the scores of this candidate in the classes of the test scenes, `scenes`."""
+        """Return the scores of this candidate in the classes of the test scenes, `scenes`.
+
+        Baselines are fitted to `data`, which has the same classes, so they need no translation.
+        """
         if self.scene_model is None:
             return _baselines(data, say)
         model = artifact_model(self.scene_model)

@@ -200,6 +200,7 @@ def flag_outliers(
     """Return the listed classes that `/outliers` reports as outliers."""
     flags = torch.zeros(v.shape, dtype=torch.bool)
     for row, scene in enumerate(_scenes(v)):
+        # Column 1 of each class, in ascending order, is 1 if it is an outlier.
         flags[row, v[row] > 0] = torch.from_numpy(judge(artifact, scene, sensitivity)[:, 1] > 0)
     return flags
 
