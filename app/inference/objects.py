@@ -347,19 +347,21 @@ def _explained_log_odds(
     `rows` are the indices of listed targets among the listed classes, empty for unlisted targets.
     The logits x of a listed target leave out its own contribution.
     """
-    N, n, others = len(targets), len(classes) if explained else 0, states - 1
-    without = np.empty((max(len(rows), 1), len(x)), np.float32)
-    without[0] = x
-    for i in range(len(rows)):
-        without[i] = x - contributions[rows[i]]
-    raised, removed = W[targets], -contributions[:n]
-    for factors in (raised.reshape(-1), removed.reshape(-1)):
-        for k in range(len(factors)):
-            factors[k] = exp(factors[k])
+    N, n, H1, others = len(targets), len(classes) if explained else 0, len(x), states - 1
+    without = np.empty((max(len(rows), 1), H1), np.float32)
+    raised, removed = np.empty((N, H1), np.float32), np.empty((n, H1), np.float32)
+    for i in range(len(without)):
+        for k in range(H1):
+            without[i, k] = x[k] - contributions[rows[i], k] if len(rows) else x[k]
+    for i in range(N):
+        for k in range(H1):
+            raised[i, k] = exp(W[targets[i], k])
+    for j in range(n):
+        for k in range(H1):
+            removed[j, k] = exp(-contributions[j, k])
+    by_unit = H1 // others, others
     log_odds, change = _hidden_changes(
-        all_states(without, states),
-        raised.reshape(N, len(x) // others, others),
-        removed.reshape(n, len(x) // others, others),
+        all_states(without, states), raised.reshape(N, *by_unit), removed.reshape(n, *by_unit)
     )
     mean, of_source = _source_effects(f, a, classes, presence, rows, targets, n)
     for i in range(N):

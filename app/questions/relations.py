@@ -183,7 +183,7 @@ def _disagreements(
     if scene.relations is None or not scene.triples:
         return []
     stated = scene.relations.holding.known(A)
-    *pairs, likely, observed, kinds = _expected_relations(
+    chosen, *grids, holds = _expected_relations(
         model.relation_slopes.relation_given,
         posterior.pair_log_odds(),
         posterior.present.log_counts,
@@ -193,15 +193,19 @@ def _disagreements(
         max(least, EXPECTED),
         top_k,
     )
-    columns = *(column.tolist() for column in pairs), significant(likely), significant(observed)
+    first, second = np.divmod(chosen, len(row))
+    subjects, expected, likely, observed = (grid[first, second] for grid in grids)
+    objects = first + second - subjects
+    columns = subjects.tolist(), objects.tolist(), expected.tolist()
+    probabilities = significant(likely), significant(observed)
     return [
         {
             **_names(scene, A, subject, object_, flags.nonzero()[0].tolist(), kind),
             "probability": probability,
             "observed_probability": observed_probability,
         }
-        for subject, object_, kind, probability, observed_probability, flags in zip(
-            *columns, kinds, strict=True
+        for subject, object_, kind, flags, probability, observed_probability in zip(
+            *columns, holds[subjects, objects], *probabilities, strict=True
         )
     ]
 
@@ -329,34 +333,33 @@ def _expected_relations(
     least: float,  # minimum probability of an expected relation
     count: int,  # maximum number k of pairs
 ) -> tuple[
-    Int[NDArray, " k"], Int[NDArray, " k"], Int[NDArray, " k"], Float[NDArray, " k"],
-    Float[NDArray, " k"], Bool[NDArray, "k 2*A"],
+    Int[NDArray, " k"], Int[NDArray, "N N"], Int[NDArray, "N N"], Float[NDArray, "N N"],
+    Float[NDArray, "N N"], Bool[NDArray, "N N 2*A"],
 ]:  # fmt: skip
     """Return the pairs of objects whose observed relations differ most from the expected one.
 
-    The results are subject, object, expected relation, its probability, that of the likeliest
-    observed relation, and the observed relations. A + a is the opposite of relation a. The subject
-    is that of the first observed relation. x and y are objects, i and j their classes, and of the
-    pair (x, y), s is the subject and o the object.
+    The first result is the number x N + y of each pair (x, y). The others are, for all pairs:
+    subject, expected relation, its probability, that of the likeliest observed relation, and the
+    observed relations. A + a is the opposite of relation a. The subject s is that of the first
+    observed relation, and o is the other object. i and j are classes.
     """
     (A, n), size, p = log_odds.shape[:2], len(row), _between_classes(slopes, log_odds, log_counts)
     holds, of_classes = np.zeros((size, size, 2 * A), np.bool_), np.zeros((n, n, 2 * A), np.bool_)
-    for a, x, y in stated:
-        i, j = row[x], row[y]
+    for t in range(len(stated)):
+        a, x, y = stated[t, 0], stated[t, 1], stated[t, 2]
         holds[x, y, a] = holds[y, x, A + a] = True
-        of_classes[i, j, a] = of_classes[j, i, A + a] = True
+        of_classes[row[x], row[y], a] = of_classes[row[y], row[x], A + a] = True
     expected, subject = np.zeros((size, size), np.int64), np.zeros((size, size), np.int64)
     likely, observed = np.zeros((size, size)), np.zeros((size, size))
-    usable = np.zeros((size, size), np.bool_)
+    ratio, usable = np.zeros(size * size), np.zeros(size * size, np.bool_)
     for x in range(size):
         for y in range(x + 1, size):
-            if not ((judged[x, y] or judged[y, x]) and holds[x, y].any()):
-                continue
-            s, o = x, y
+            s, o = -1, -1
             for a in range(A):
-                if holds[x, y, a] or holds[y, x, a]:
+                if s < 0 and (holds[x, y, a] or holds[y, x, a]):
                     s, o = (x, y) if holds[x, y, a] else (y, x)
-                    break
+            if s < 0 or not (judged[x, y] or judged[y, x]):
+                continue
             i, j = row[s], row[o]
             for kind in range(2 * A):
                 a = kind % A
@@ -367,16 +370,10 @@ def _expected_relations(
                 if holds[s, o, kind]:
                     observed[x, y] = max(observed[x, y], value)
             is_new = not of_classes[i, j, expected[x, y]]
-            usable[x, y] = is_new and likely[x, y] > observed[x, y] and likely[x, y] >= least
-            subject[x, y] = s
-    chosen = best((likely / observed).reshape(-1), usable.reshape(-1), count)
-    subjects = subject.reshape(-1)[chosen]
-    objects = chosen // size + chosen % size - subjects  # the other object of the pair
-    kinds = np.empty((len(chosen), 2 * A), np.bool_)
-    for k in range(len(chosen)):
-        kinds[k] = holds[subjects[k], objects[k]]
-    grids = expected.reshape(-1)[chosen], likely.reshape(-1)[chosen], observed.reshape(-1)[chosen]
-    return subjects, objects, *grids, kinds
+            pair, subject[x, y] = x * size + y, s
+            ratio[pair] = likely[x, y] / observed[x, y]
+            usable[pair] = is_new and likely[x, y] > observed[x, y] and likely[x, y] >= least
+    return best(ratio, usable, count), subject, expected, likely, observed, holds
 
 
 @inlined
