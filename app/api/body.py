@@ -261,13 +261,15 @@ class JSONRoute(APIRoute):
         schema: Any = self.body_field.field_info.annotation  # type: ignore[union-attr]
         most = http.app.state.settings.max_scene_bytes
         ticket = scope["state"]["ticket"]
-        if len(body) <= SMALL:
+
+        def read(_: object) -> tuple[Any, Any]:
             value = parse(body, most)
-            data = validated(value, schema)
+            return value, validated(value, schema)
+
+        if len(body) <= SMALL:
+            value, data = read(None)
         else:
-            in_worker = runtime.admission.in_worker
-            value = await in_worker(ticket, lambda _: parse(body, most))
-            data = await in_worker(ticket, lambda _: validated(value, schema))
+            value, data = await runtime.admission.in_worker(ticket, read)
         try:
             answer: bytes = await self.endpoint(data=data, http=http, **scope["path_params"])
         except errors.RequestError as error:

@@ -106,9 +106,8 @@ class Recorded:
     """Complete the headers of each response, and record the request in metrics and access log.
 
     Later steps find in ``scope["state"]`` the `Record`, the request id, and the path below the root
-    path of the service.
-    The client may choose the request id: 1 to 128 unreserved URI characters or colons. The
-    application ``other`` gets everything but requests, such as the start of the service.
+    path of the service. The client may choose the request id: 1 to 128 unreserved URI characters or
+    colons. The application ``other`` gets everything but requests, such as the service's start.
     """
 
     def __init__(self, app: ASGIApp, other: ASGIApp, settings: Settings, runtime: Runtime) -> None:
