@@ -226,7 +226,7 @@ def _moves(boxes: _Boxes, rng: Rng) -> Iterator[tuple[Bool[NDArray, "n n"], _Pla
     ]
     kinds = [kinds[k] for k in rng.permutation(len(kinds)).tolist()]
     on_floor = (bottom <= boxes.floor + CONTACT) & ~boxes.supports.any(1)
-    # A stranger high and large enough that nobody would call it a place for the object.
+    # The stranger is high and large enough to carry the object.
     carries = boxes.strange & (height >= _LEAST_STEP) & (_LEAST_AREA * area[:, None] <= area)
     lifted = carries & on_floor[:, None], _onto
     # Objects of the floor are lifted first with the probability `_LIFTED`, otherwise last.

@@ -171,7 +171,7 @@ def _alarms(home: Home, index: Int[NDArray, "N"], sides: Sides) -> Bool[NDArray,
 def _change(home: Home, weights: Weights, recorded: torch.Tensor, seed: int) -> float:
     """Return the mean change of the probability of unrecorded classes in stored samples."""
     samples = torch.from_numpy(home.parent.weights.chain_samples)
-    samples = samples[samples.sum(1) >= 2][:256]  # a part needs two classes; 256 suffice for a mean
+    samples = samples[samples.sum(1) >= 2][:256]  # a part needs two classes
     parts = random_parts(samples, _LEAVE_ONE_OUT, torch.Generator().manual_seed(seed))
     before, after = (
         machine_of(side).object_log_odds(parts.listed, share=parts.share).sigmoid()

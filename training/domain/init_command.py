@@ -94,7 +94,7 @@ def init(
         write_whole(path, text)
     written = "of written things or " if material.places else ""
     _show(proposal, f"classes {written}with at least {proposal.minimum} mentions")
-    # The next command publishes a model of written places, because it needs no comparison first.
+    # With written places, the next command also publishes the model.
     lines = _next(name, folder, promoted=not material.places)
     print_lines(f"\nwritten: {', '.join(map(str, targets))}", *lines)
 

@@ -81,7 +81,7 @@ def fit_place(sources: Sequence[Sequence[PlaceTerms]]) -> PlaceFit:
     """Fit log P(at the place) = log P(present) + log σ(a + b·relation + c·counts).
 
     `relation` is the log-probability of the relation by the machine. `counts` is the log of how
-    much more often training shows the class at the place than elsewhere. The penalised likelihood
+    much more often training shows the class at the place than in general. The penalised likelihood
     is maximal. A source has a group of terms for each question. All sources have equal weight.
     """
     columns = [map(np.concatenate, zip(*terms, strict=True)) for terms in sources]

@@ -294,9 +294,9 @@ def measure_entries(
 ) -> tuple[Reports, dict[str, str]]:
     """Return the reports by (name, seed), and the error messages of diverged entries by name.
 
-    A name whose training diverges with one seed has no reports, because a mean over its other seeds
-    would look too good. Finished reports are read, unless `fresh` deletes them. `workers` processes
-    with one thread each measure the rest; 1 means this process. KeyboardInterrupt stops them.
+    A name whose training diverges with one seed has no reports. Finished reports are read, unless
+    `fresh` deletes them. `workers` processes with one thread each measure the rest; 1 means this
+    process. KeyboardInterrupt stops the processes.
     """
     if fresh:
         for entry in entries:
