@@ -120,7 +120,8 @@ def _read(
         model.vocabulary,
         limits,
         look_ups,
-        roles=None if model.places is None else model.places.roles,
+        roles=model.roles,
+        spread=model.spread,
         profiles=artifact.manifest.vocabulary.profiles,
         may_be_empty=question.samples,
     )

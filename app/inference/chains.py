@@ -44,6 +44,7 @@ from app.inference.relation_units import (
     relation_units,
 )
 from app.inference.weights import Weights, unpack_scenes
+from app.scene.relation_table import HOLDS
 
 Bits = UInt8[NDArray, " V"]
 """Presence of each class."""
@@ -241,7 +242,7 @@ class ConditionedChains:
             a, i, j = observed.a, rows[observed.i], rows[observed.j]  # relation, subject, object
             has_unit = logits[a, i, j] > NEVER / 2
             units = a[has_unit], i[has_unit], j[has_unit]
-            r[units], free[units] = observed.r[has_unit] > 0, False
+            r[units], free[units] = observed.r[has_unit] >= HOLDS, False
         uniform, group_numbers = stream.random((2, *r.shape), np.float32)
         hidden_logits = self._hidden_logits(classes)
         weight = self._chains.units.implication_weights(hidden_logits, float(self._beta))

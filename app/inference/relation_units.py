@@ -27,6 +27,7 @@ from app.compiling import compiled, compiled_in_any_order
 from app.inference.elementary import to_log_odds
 from app.inference.implications import implication_shifts
 from app.inference.weights import Weights, state_means
+from app.scene.relation_table import HOLDS
 
 Means = Float[NDArray, "B H1"]
 """B different means of h1."""
@@ -50,12 +51,12 @@ _LEFT_OUT: Final = 1.6e-2
 
 @dataclass(frozen=True, slots=True)
 class ObservedRelations:
-    """E observed relations between the n classes of a scene, which hold or do not hold."""
+    """E observed relations between the n classes of a scene."""
 
     a: Int[NDArray, " E"]  # relation (left, on top, ...)
     i: Int[NDArray, " E"]  # subject class, from 0 to n - 1
     j: Int[NDArray, " E"]  # object class, from 0 to n - 1
-    r: Float[NDArray, " E"]  # 1 if the relation holds, else 0
+    r: Float[NDArray, " E"]  # probability of the relation
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +138,7 @@ class RelationUnits(ABC):
             shift = np.zeros_like(mean)
             return RelationLogits(mean, spread, shift, shift)
         r = np.zeros(mean.shape, np.bool_)
-        r[observed.a, observed.i, observed.j] = (observed.r > 0) & (observed.i != observed.j)
+        r[observed.a, observed.i, observed.j] = (observed.r >= HOLDS) & (observed.i != observed.j)
         shift = np.ascontiguousarray(implication_shifts(weight, r).transpose(2, 0, 1))
         # The first 2A features are the relations of the same two classes, in both directions.
         steps = np.concatenate([r, r.swapaxes(1, 2)]).reshape(2 * self._A, n * n)

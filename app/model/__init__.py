@@ -16,11 +16,12 @@ from app.model.calibration import (
     Sensitivity,
     Sharpness,
 )
+from app.model.possibility import Possibility
 from app.model.scene_model import SceneModel
 from app.model.statistics import Counts, Offsets, Places
 
 __all__ = [
     "AlarmLine", "AlarmLines", "Calibration", "CountSlope", "Counts", "CoverageFit", "FitLimit",
-    "Judgement", "Misplaced", "Offsets", "PlaceFit", "Places", "SceneModel", "Sensitivity",
+    "Judgement", "Misplaced", "Offsets", "PlaceFit", "Places", "Possibility", "SceneModel", "Sensitivity",
     "Sharpness",
 ]  # fmt: skip

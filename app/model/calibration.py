@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final, NamedTuple, Self
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from app.model.fields import Count, Frozen, Many
 from app.scene.spatial_relations import CANONICAL
@@ -129,15 +129,22 @@ class AlarmLines(Frozen):
     high: AlarmLine
 
 
-KINDS: Final = ("lateral", "support", "above", "under", "stand")
-"""Kinds of entries in `misplaced`; see `app.questions.misplaced`."""
+KINDS: Final = (
+    *("lateral", "support", "above", "under"),
+    *("on_floor", "on_object", "unheld"),
+)
+"""Kinds of entries in `misplaced`; see `app.questions.misplaced`. The last three are of boxes."""
+
+WEIGHTS: Final = ("relation", "change", "stand", "supporter", "unknown", "entries")
+"""Fields of `Judgement` with the weights of the terms z, d, s, q, u and l of an entry."""
 
 
 class Judgement(Frozen):
     """The log-odds that an entry of `misplaced` is wrong, and the lines of an alarm.
 
-    The log-odds are intercept + relation·z + change·d + stand·s + supporter·q, with the terms of
-    `app.questions.misplaced`. n of the lines is the number of entries of the kind in the scene.
+    The log-odds are intercept + relation·z + change·d + stand·s + supporter·q + unknown·u +
+    entries·l, with the terms of `app.questions.misplaced`. n of the lines is the number of entries of the kind in
+    the scene.
     """
 
     intercept: float
@@ -145,26 +152,28 @@ class Judgement(Frozen):
     change: float
     stand: float
     supporter: float
+    unknown: float
+    entries: float
     lines: AlarmLines
 
 
 class Misplaced(Frozen):
     """The judgement of each kind of entry. None: training had too few scenes for the fit."""
 
-    model_config = ConfigDict(validate_by_name=True, serialize_by_alias=True)
-
     lateral: Judgement | None = None
     support: Judgement | None = None
     above: Judgement | None = None
     under: Judgement | None = None
-    stand: Judgement | None = None
+    on_floor: Judgement | None = None
+    on_object: Judgement | None = None
+    unheld: Judgement | None = None
     # Relations (relation, subject, object) between classes that a person has confirmed.
-    confirmed: Many[tuple[Count, Count, Count]] = Field(default=(), alias="usual")
+    confirmed: Many[tuple[Count, Count, Count]] = ()
 
     @property
     def judges_relations(self) -> bool:
         """Whether the model judges any kind of relation."""
-        return any(getattr(self, kind) is not None for kind in KINDS if kind != "stand")
+        return any(getattr(self, kind) is not None for kind in KINDS)
 
 
 class Calibration(Frozen):

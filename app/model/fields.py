@@ -2,7 +2,7 @@
 
 import json
 from abc import abstractmethod
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass, fields
 from datetime import UTC
 from typing import Annotated, Any, ClassVar, TypeVar
@@ -55,12 +55,11 @@ class TensorGroup:
 
     A subclass is a dataclass of arrays. The annotation of a field contains the name or the number
     of each size: `Annotated[Table, "V", 3]`. The name of a stored tensor is `prefix` and the name
-    of the field, or its name in `stored_as`. The fields in `integers` have integers, all others
+    of the field. The fields in `integers` have integers, all others
     floating-point numbers.
     """
 
     prefix: ClassVar[str]
-    stored_as: ClassVar[Mapping[str, str]] = {}
     integers: ClassVar[Collection[str]]
 
     def tensors(self) -> dict[str, NDArray[Any]]:
@@ -70,7 +69,7 @@ class TensorGroup:
     @classmethod
     def tensor(cls, field: str) -> str:
         """Return the name of the tensor of a field."""
-        return f"{cls.prefix}{cls.stored_as.get(field, field)}"
+        return f"{cls.prefix}{field}"
 
     @abstractmethod
     def check(self, A: int, V: int, C: int) -> None:

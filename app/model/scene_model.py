@@ -15,8 +15,10 @@ from app.inference.chains import SceneChains
 from app.inference.objects import ObjectScorer
 from app.inference.relation_units import RelationUnits, StandIns, relation_units
 from app.model.calibration import Calibration, RelationSlopes
+from app.model.possibility import Possibility, UnitsWithPrior
 from app.model.statistics import Counts, Offsets, Places
 from app.model.word_weights import RowMap
+from app.scene.roles import RoleCounts
 from app.scene.vocabulary import Vocabulary, Word
 
 _MOST_KEPT: Final = 4  # models with words that a model keeps, of about 20 MB each
@@ -35,6 +37,17 @@ class SceneModel:
     offsets: Offsets | None = None  # None: no training scene has poses
     counts: Counts | None = None  # None: training has no numbers of instances
     places: Places | None = None  # None: no training scene has relations
+    possibility: Possibility | None = None  # None: no class has a description
+
+    @property
+    def roles(self) -> RoleCounts | None:
+        """Roles of boxes that reach into each other."""
+        return None if self.places is None else self.places.roles
+
+    @property
+    def spread(self) -> Float[NDArray[np.float32], "V"] | None:
+        """Standard deviations of the log of the sizes of the classes."""
+        return None if self.possibility is None else self.possibility.spread
 
     @cached_property
     def spec(self) -> MachineSpec:
@@ -48,8 +61,18 @@ class SceneModel:
 
     @cached_property
     def relation_units(self) -> RelationUnits:
-        """Relation units of the machine. The first access prepares the weights."""
-        return relation_units(self.weights)
+        """Relation units of the machine, with the prior. The first access prepares the weights."""
+        units = relation_units(self.weights)
+        if self.possibility is None or self.places is None:
+            return units
+        return UnitsWithPrior(self.weights, units, self.descriptions, self.possibility, self.places)
+
+    @cached_property
+    def descriptions(self) -> Float[NDArray[np.float64], "V columns"]:
+        """Rows of the prior of possibility for all classes, with their typical sizes."""
+        if self.possibility is None:
+            return np.zeros((self.spec.V, 0))
+        return self.possibility.rows(np.arange(self.spec.V), self.vocabulary.sizes)
 
     @cached_property
     def relation_slopes(self) -> RelationSlopes:

@@ -2,20 +2,19 @@
 
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled
 from app.model.fields import TensorGroup
 from app.scene.roles import IN, ON, UNDER, RoleCounts, find_row, role_counts
-from app.scene.spatial_relations import CANONICAL, FRONT, LEFT, ON_TOP, STACKED, SUPPORTS
-from app.scene.stands import HANGS, SUPPORTED, USUAL
+from app.scene.spatial_relations import CANONICAL, FRONT, LEFT, SUPPORTS
 
 Floats = NDArray[np.float64]
 Table = NDArray[np.float32]
@@ -296,7 +295,6 @@ _RELATION: Final = 3.0  # smoothing m, in scenes
 _SUPPORTER: Final = 10.0  # smoothing of the supporters of a class, in scenes
 _SEEN: Final = 0.5  # smoothing of the counts of supporters
 _OTHER_ROLES: Final = 0.5  # smoothing of the counts of other roles
-_LEAST_STAND: Final = 0.005  # minimum share of a stand
 _SHOWN: Final = 2.0  # minimum number of scenes that show a relation
 
 
@@ -316,7 +314,6 @@ class Places(TensorGroup):
 
     prefix: ClassVar[str] = "places."
     integers = ("triple", "role_pair")
-    stored_as: ClassVar[Mapping[str, str]] = {"triple_scenes": "held"}
 
     triple: Annotated[NDArray[np.int32], "N"]  # keys (a V + i) V + j of a(i, j), ascending
     triple_scenes: Annotated[NDArray[np.float32], "N"]  # number of training scenes with each triple
@@ -325,13 +322,15 @@ class Places(TensorGroup):
     role_counts: Annotated[NDArray[np.float32], "P", 3]
     role_anchor: Annotated[NDArray[np.float32], "V", 3]
     stands: Annotated[NDArray[np.float32], "V", 3]  # shares: on the floor, hanging, supported
+    # Share of the objects on or in each class whose bottoms are far below its top: seats, shelves.
+    within: Annotated[NDArray[np.float32], "V"]
 
     def check(self, A: int, V: int, C: int) -> None:
         """Check the values for a machine with A relations and V classes."""
         self.require(len(self.triple), "there must be at least one triple")
         self.require_keys("triple", A * V * V)
         self.require_keys("role_pair", V * V)
-        counts = self.triple_scenes, self.role_counts, self.role_anchor, self.stands
+        counts = self.triple_scenes, self.role_counts, self.role_anchor, self.stands, self.within
         is_right = all((array >= 0).all() for array in counts) and (self.frequency > 0).all()
         self.require(is_right, "counts must be at least 0, and frequencies must be above 0")
 
@@ -352,23 +351,20 @@ class Places(TensorGroup):
         smoothed[classes[begin:end]] += counts[begin:end]
         return np.log(smoothed / ((counts[begin:end].sum() + _PLACE) * self.frequency))
 
-    def shows(
-        self, relation: int, subject: Int[Indices, "N"], other: Int[Indices, "M"]
-    ) -> Bool[NDArray[np.bool_], "N M"]:
-        """Return whether training shows a relation of classes. A single scene may be an error."""
+    def scenes(
+        self, relations: Sequence[int], subject: Int[Indices, "N"], other: Int[Indices, "M"]
+    ) -> Float[Floats, "R N M"]:
+        """Return the number of training scenes with each relation of each two classes."""
         V = len(self.frequency)
-        counts = _triple_counts(self.triple, self.triple_scenes, V, relation, subject, other)
-        return counts >= _SHOWN
+        tables = self.triple, self.triple_scenes, V
+        return np.stack([_triple_counts(*tables, a, subject, other) for a in relations])
 
     def supporters(
         self, subject: Int[Indices, "N"], other: Int[Indices, "M"]
     ) -> Float[Floats, "N M"]:
         """Return the share of each class among the objects on or in which each subject class is."""
         total, share = self._supporters
-        V, of_pairs = len(self.frequency), _SUPPORTER * share[other]
-        triples = self.triple, self.triple_scenes, V
-        for relation in SUPPORTS:
-            of_pairs = of_pairs + _triple_counts(*triples, relation, subject, other)
+        of_pairs = _SUPPORTER * share[other] + self.scenes(SUPPORTS, subject, other).sum(0)
         return of_pairs / (total[subject, None] + _SUPPORTER)
 
     @cached_property
@@ -381,21 +377,6 @@ class Places(TensorGroup):
         total, count = (np.bincount(role, scenes, V).astype(float) for role in (subject, other))
         return total, (count + _SEEN) / (count + _SEEN).sum()
 
-    @cached_property
-    def unseen(self) -> tuple[UInt8[NDArray, "V V"], Float[NDArray, "3 V"]]:
-        """Stacked relations that training shows, and the change of the log-odds of the others.
-
-        The change is the log share of the subject's stand, at most `USUAL`: on a wall for above, on
-        or in an object for on-top and inside. So a blackboard does not stand on a chair. The values
-        are the first two arguments of `add_unseen`.
-        """
-        shares = np.log(np.minimum(np.maximum(self.stands, _LEAST_STAND) / USUAL, 1.0))
-        every = np.arange(len(shares))
-        shown = np.zeros((len(every), len(every)), np.uint8)
-        for bit, a in enumerate(STACKED):
-            shown |= self.shows(a, every, every).astype(np.uint8) << bit
-        return shown, shares.T[[SUPPORTED, HANGS, SUPPORTED]].astype(np.float32)
-
     def under_evidence(self, upper: int, lower: int) -> float:
         """Return log(n · n / m), with n scenes that show the lower class under the upper.
 
@@ -406,6 +387,14 @@ class Places(TensorGroup):
         if counts[UNDER] <= 0:
             return -math.inf
         return math.log(counts[UNDER] ** 2 / (counts[ON] + counts[IN] + _OTHER_ROLES))
+
+    def literal_share(self, upper: int, lower: int) -> float:
+        """Return the share of "upper on top of lower" whose words say this, not "lower under upper".
+
+        It is 1 if no words say "under".
+        """
+        on = float(role_counts(self.roles, upper, lower)[ON]) + _OTHER_ROLES
+        return on / (on + float(role_counts(self.roles, lower, upper)[UNDER]))
 
     def means_under(self, upper: int, lower: int) -> bool:
         """Return whether "upper on top of lower" means lower under upper, as with desk and bin."""
@@ -435,27 +424,6 @@ class Places(TensorGroup):
                 (start, other[order], self.triple_scenes[order].astype(np.float64), back_off)
             )
         return tuple(tables)
-
-
-@compiled
-def add_unseen(
-    shown: UInt8[NDArray, "V V"],  # bit a: training shows relation a of `STACKED`
-    change: Float[NDArray, "3 V"],  # for each subject class
-    candidates: Int[NDArray, " N"],
-    classes: Int[NDArray, " m"],
-    forward: Float[NDArray, "N A m"],  # log-odds with the candidate as subject
-    backward: Float[NDArray, "N A m"],  # log-odds with the other class as subject
-) -> None:
-    """Add the changes of stacked relations that training never shows to log-odds, in place."""
-    # a is an index in `STACKED`, which are the last canonical relations, from `ON_TOP`.
-    for c in range(len(candidates)):
-        for a in range(forward.shape[1] - ON_TOP):
-            for k in range(len(classes)):
-                i, j = candidates[c], classes[k]
-                if not shown[i, j] >> a & 1:
-                    forward[c, ON_TOP + a, k] += change[a, i]
-                if not shown[j, i] >> a & 1:
-                    backward[c, ON_TOP + a, k] += change[a, j]
 
 
 @compiled

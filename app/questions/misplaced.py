@@ -1,40 +1,38 @@
-"""Misplaced relations: which observed relations are wrong, and which object has moved?
+"""Misplaced objects: which stated relations are wrong, and which boxes are at a wrong place?
 
-An entry is an observed relation, or an object that nothing supports. There are five kinds:
+Without boxes, an entry is a relation that the request states. There are four kinds:
 
     lateral   left or front
     support   an object on or in another object
     above     an object above another object
     under     an object under another object: a bin under a desk
-    stand     an object that stands on the floor or hangs; it has no relation
 
 "Under" is the opposite of on-top, so both have one unit: "the desk is on top of the bin". The words
-of the request tell them apart, or the boxes. People also say "under" for "below", so z of such an
-entry is the larger of the two. It is at least `Places.under_evidence`. An object may be above
-another object if a third object supports it.
+of the request tell them apart. People also say "under" for "below", so z of such an entry is the
+larger of the two. It is at least `Places.under_evidence`. An object may be above another object if
+a third object supports it.
 
-The log-odds that an entry is wrong are a weighted sum of four terms (`app.model.Judgement`):
+With boxes, an entry is an object. The likeliest wrong place of its box (`app.questions.standing`)
+gives one of three kinds: on_floor, on_object, and unheld if it floats or is sunk in.
 
-    z   log-odds of the relation given the objects, at least `LEAST_Z`
+The log-odds that an entry is wrong are a weighted sum of six terms (`app.model.Judgement`):
+
+    z   log-odds of the relation given the objects, at least `LEAST_Z`, times k
     d   change of these log-odds by the other observed relations
-    s   log p(stand) of the object that would have moved
-    q   log of the share of its supporter among the supporters of its class (`Places.supporters`)
+    s   log share of objects of the class on or in objects; with boxes, -t of `Standing`
+    q   log of the share of the supporter among the supporters of the class (`Places.supporters`)
+    u   1 - k, times the sum of these log-odds and of the prior (`app.model.possibility`)
+    l   log of the number of entries, because hardly more than one entry of a scene is wrong
 
-The stand of an object is what holds it (`app.scene.stands`). `Places.stands` has the shares S of
-the floor, of the wall and of supports for its class. An object that is neither on the floor nor on
-or in a listed object hangs on a wall, or an unlisted object holds it:
-
-    p(floor) = S_floor    p(supported) = S_support    p(neither) = S_wall + S_support · (1 - sum q)
-
-The sum of the shares q is over the listed classes. Positions and sizes show the stand of every
-object; otherwise s = 0. Classes that belong everywhere, such as pets and bags, have s = q = 0, and
-only their supports are judged.
+k = n / (n + 2) is the share of the log-odds that n training scenes with the relation show. z, d, q
+and u are those of the support, and 0 for other kinds with boxes. Classes that belong everywhere,
+such as pets and bags, have s = q = 0, and only their supports are judged.
 
 A relation that a person has confirmed (`app.model.Misplaced.confirmed`) has z = `EXPLAINED` and
-d = s = q = 0, because its stand may be rare for the class.
+d = s = q = u = 0, because its place may be rare for the class.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import chain
 from typing import Final, NamedTuple
 
@@ -43,40 +41,48 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from app.inference.elementary import sigmoid
-from app.model.calibration import KINDS, Judgement, Sensitivity
+from app.model.calibration import KINDS, WEIGHTS, Judgement, Sensitivity
+from app.model.possibility import IN, ON, OVER, UNDER, known_share
 from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, significant
 from app.questions.posterior import Posterior
+from app.questions.standing import FLOATS, ON_FLOOR, ON_OBJECT, SUNK, Standing, standing
 from app.scene.relation_table import Triple
-from app.scene.scene import Scene, boxes_of
+from app.scene.scene import Scene, boxes_of, errors_of
 from app.scene.spatial_relations import (
     ABOVE,
     CANONICAL,
     INSIDE,
     LATERAL,
     ON_TOP,
+    STACKED,
     SUPPORTS,
     opposite,
 )
-from app.scene.stands import (
-    FLOOR,
-    HANGS,
-    SUPPORTED,
-    UNKNOWN,
-    USUAL,
-    Heights,
-    floor_level,
-    stands_of,
-)
+from app.scene.stands import FLOOR, SUPPORTED, USUAL, floor_level
 
-BESIDE, SUPPORT, OVER, BELOW, STAND = range(len(KINDS))  # indices of the kinds in `KINDS`
-TERMS: Final = 4  # number of terms of an entry
+BESIDE, SUPPORT, OVER_IT, BELOW, POSED, HELD, UNHELD = range(len(KINDS))
+"""Indices of kinds in `KINDS`. From `POSED` on, entries are about boxes."""
+
+_REASONS: Final = {
+    ON_FLOOR: (ON_TOP, POSED, "on-floor"), ON_OBJECT: (ON_TOP, HELD, "wrong-support"),
+    FLOATS: (ABOVE, UNHELD, "floats"), SUNK: (INSIDE, UNHELD, "sunk-in"),
+}  # fmt: skip
+"""Relation, kind and name of the reasons of `Standing`. On top of an object may also be inside."""
+
+_REASON_OF: Final = {
+    **{(relation, kind): name for relation, kind, name in _REASONS.values()},
+    (INSIDE, HELD): "wrong-support",
+}
+
+TERMS: Final = 6  # number of terms of an entry
 
 THE_FLOOR: Final = "floor"
-"""Name of the floor in an entry about an object that stands on the floor or hangs above it."""
+"""Name of the floor in an entry about an object that stands on the floor or floats above it."""
 
 LEAST_Z: Final = -8.0  # below it, log-odds do not tell wrong relations from rare ones
-_LEAST_P: Final = 1e-6  # minimum of p(stand)
+_LEAST_P: Final = 1e-6  # minimum of a share
+LEAST_LISTED: Final = 0.05  # least probability of a listed box that is not on an object
 EXPLAINED: Final = 5.0
 """z of a confirmed relation; minimum z of an object above another object on a third object."""
 
@@ -89,7 +95,7 @@ class Entries(NamedTuple):
 
     triple: Int[Indices, "n 3"]  # relation, subject and object, which is -1 for the floor
     kind: Int[Indices, "n"]  # index in `KINDS`
-    terms: Float[Floats, "n 4"]  # z, d, s and q; see the module
+    terms: Float[Floats, "n 6"]  # z, d, s, q, u and l; see the module
     mover: Int[Indices, "n"]  # object that would have moved if the entry is wrong
 
 
@@ -97,128 +103,176 @@ _NO_ENTRIES: Final = Entries(
     np.zeros((0, 3), np.int64), np.zeros(0, np.int64), np.zeros((0, TERMS)), np.zeros(0, np.int64)
 )
 
+# An entry has relation a, subject i, object j, kind, the terms z, d, s, q and u, and the mover.
+_Entry = tuple[float, ...]
+
 
 def entries_of(model: SceneModel, posterior: Posterior, scene: Scene) -> Entries:
     """Return the entries that the model can judge. Training learns no relations of structure."""
-    row, A, places = posterior.present.row, model.spec.A, model.places
-    classes = model.vocabulary.stand_in[posterior.present.classes][row]
-    is_thing = (~model.vocabulary.structure[classes]).tolist()
-    stated = [t for t in scene.triples if t[0] < A and is_thing[t[1]] and is_thing[t[2]]]
-    if not stated and not scene.has_boxes:
+    entries = list((_posed if scene.has_boxes else _stated)(model, posterior, scene))
+    if not entries:
         return _NO_ENTRIES
-    heights, around, opposites = None, None, scene.opposites
-    if scene.has_boxes:
-        heights = _heights(model, scene, classes)
-        around = heights.around
-    unders = {
-        (a, i, j)
-        for a, i, j in stated
-        if a == ON_TOP and ((a, i, j) in opposites if around is None else around[i, j])
-    }
-    supports = [(i, j) for a, i, j in stated if a in SUPPORTS and (a, i, j) not in unders]
-    stands, log_p, log_q = (
-        values.tolist() for values in _stands(model, posterior, scene, supports, heights)
-    )
-    moves = (~model.vocabulary.anywhere[classes]).tolist()
-    relation, subject, object_ = np.fromiter(chain(*stated), np.int64).reshape(-1, 3).T
-    alone, pairs = posterior.alone_log_odds(), (row[subject], row[object_])
-    of_relation, changes = (
-        values[relation, *pairs].tolist() for values in (alone, posterior.relation_change())
-    )
-    confirmed = {*model.calibration.misplaced.confirmed}
-    # An entry has relation a, subject i, object j, kind, the terms z, d, s and q, and the mover.
-    entries: list[tuple[float, ...]] = []
-    for (a, i, j), z, d in zip(stated, of_relation, changes, strict=True):
-        mover = j if (a, i, j) in opposites and a != INSIDE else i
-        s = q = 0.0
+    table = np.fromiter(chain(*entries), np.float64).reshape(len(entries), -1)
+    numbers, log_n = table.astype(np.int64), np.full((len(table), 1), np.log(len(table)))
+    terms = np.concatenate([table[:, 4:-1], log_n], axis=1)
+    return Entries(numbers[:, :3], numbers[:, 3], terms, numbers[:, -1])
+
+
+class _Evidence:
+    """The terms of the relations between the objects of a scene."""
+
+    def __init__(self, model: SceneModel, posterior: Posterior) -> None:
+        present, vocabulary, places = posterior.present, model.vocabulary, model.places
+        self.row, self.places = present.row, places
+        listed = vocabulary.stand_in[present.classes]
+        self.classes = listed[self.row]
+        self.is_thing = ~vocabulary.structure[self.classes]
+        self.moves = ~vocabulary.anywhere[self.classes]
+        N, n = len(self.row), len(listed)
+        self.stands, self.supporters = np.ones((N, 3)), np.ones((N, n))
+        if places is not None:
+            self.stands = places.stands[self.classes].astype(np.float64)
+            self.supporters = places.supporters(self.classes, listed)
+            self.supporters[:, vocabulary.structure[present.classes]] = 0.0
+        self._z, self._d = posterior.alone_log_odds(), posterior.relation_change()
+        self._confirmed = {*model.calibration.misplaced.confirmed}
+        self.prior, self.scenes = np.zeros((4, n, n)), np.full((len(STACKED), n, n), np.inf)
+        if model.possibility is not None and places is not None:
+            rows = model.descriptions[listed]
+            self.prior = model.possibility.log_p(rows, rows)
+            self.scenes = places.scenes(STACKED, listed, listed)
+
+    def z(self, a: int, i: int, j: int) -> float:
+        """Return the log-odds of a relation of two objects."""
+        return float(self._z[a, self.row[i], self.row[j]])
+
+    def d(self, a: int, i: int, j: int) -> float:
+        """Return the change of the log-odds of a relation by other relations."""
+        return float(self._d[a, self.row[i], self.row[j]])
+
+    def q(self, i: int, j: int) -> float:
+        """Return the log of the share of object j among the supporters of object i."""
+        return float(np.log(max(self.supporters[i, self.row[j]], _LEAST_P)))
+
+    def support(self, a: int, i: int, j: int) -> tuple[float, float]:
+        """Return the terms z and u of object i on or in object j."""
+        z, share = self.z(a, i, j), 1.0
+        if a == ON_TOP and self.places is not None:
+            share = self.places.literal_share(int(self.classes[i]), int(self.classes[j]))
+        place = ON if a == ON_TOP else IN
+        return self.known_and_unknown((a, i, j), place, z + float(np.log(share)), i, j, share)
+
+    def known_and_unknown(
+        self, triple: Triple, place: int, z: float, thing: int, other: int, share: float = 1.0
+    ) -> tuple[float, float]:
+        """Return the terms z and u of a stacked relation with a place of a thing at another.
+
+        Only the share of the training scenes counts.
+        """
+        a, i, j = triple
+        k = known_share(share * self.scenes[a - ON_TOP, self.row[i], self.row[j]])
+        z, c = max(z, LEAST_Z), self.prior[place, self.row[thing], self.row[other]]
+        return float(k * z), float((1.0 - k) * (z + c))
+
+    def is_confirmed(self, a: int, i: int, j: int) -> bool:
+        """Return whether a person has confirmed a relation of these classes."""
+        return (a, int(self.classes[i]), int(self.classes[j])) in self._confirmed
+
+
+def _stated(model: SceneModel, posterior: Posterior, scene: Scene) -> Iterator[_Entry]:
+    """Yield the entries about the relations that a request states."""
+    A, places, opposites = model.spec.A, model.places, scene.opposites
+    stated = [triple for triple in scene.triples if triple[0] < A]
+    if not stated:
+        return
+    evidence = _Evidence(model, posterior)
+    supported = {i for a, i, j in stated if a in SUPPORTS and (a, i, j) not in opposites}
+    for a, i, j in stated:
+        # Training shows no stacks of things of one class.
+        is_pair = a in LATERAL or evidence.classes[i] != evidence.classes[j]
+        if not (is_pair and evidence.is_thing[i] and evidence.is_thing[j]):
+            continue
+        is_opposite = (a, i, j) in opposites
+        mover = j if is_opposite and a != INSIDE else i
+        z, d, s, q, u = evidence.z(a, i, j), evidence.d(a, i, j), 0.0, 0.0, 0.0
         if a in LATERAL:
             kind = BESIDE
-        elif (a, i, j) in unders or (a == ABOVE and stands[i] == FLOOR):
-            if not moves[j]:
+        elif a == ON_TOP and is_opposite:
+            if not evidence.moves[j]:
                 continue
-            kind, mover = BELOW, j
-            s = log_p[j] if stands[j] == FLOOR else 0.0
-            z = float(alone[ON_TOP : ABOVE + 1, row[i], row[j]].max())
+            kind = BELOW
+            z = max(z, evidence.z(ABOVE, i, j))
             if places is not None:
+                classes = evidence.classes
                 z = max(z, places.under_evidence(int(classes[i]), int(classes[j])))
+            z, u = evidence.known_and_unknown((a, i, j), UNDER, z, j, i)
         elif a == ABOVE:
-            kind = OVER
-            if stands[i] == HANGS:
-                s = log_p[i]
-            elif stands[i] == SUPPORTED or heights is not None:
+            kind = OVER_IT
+            if i in supported:
                 z = max(z, EXPLAINED)
+            z, u = evidence.known_and_unknown((a, i, j), OVER, z, i, j)
         else:
-            kind, mover, s, q = SUPPORT, i, log_p[i], log_q[i]
-        if not moves[mover]:
+            kind, q = SUPPORT, evidence.q(i, j)
+            z, u = evidence.support(a, i, j)
+            s = float(np.log(max(evidence.stands[i, SUPPORTED], _LEAST_P)))
+        if not evidence.moves[mover]:
             s = q = 0.0
-        if (a, classes[i], classes[j]) in confirmed:
-            z, d, s, q = EXPLAINED, 0.0, 0.0, 0.0
-        entries.append((a, i, j, kind, max(z, LEAST_Z), d, s, q, mover))
-    for i, stand in enumerate(stands if heights is not None else ()):
-        if is_thing[i] and moves[i] and stand in (FLOOR, HANGS):
-            relation_to_floor = ON_TOP if stand == FLOOR else ABOVE
-            entries.append((relation_to_floor, i, -1, STAND, 0.0, 0.0, log_p[i], 0.0, i))
-    table = np.fromiter(chain(*entries), np.float64).reshape(-1, 5 + TERMS)
-    numbers = table.astype(np.int64)
-    return Entries(numbers[:, :3], numbers[:, 3], table[:, 4 : 4 + TERMS], numbers[:, -1])
+        if evidence.is_confirmed(a, i, j):
+            z, d, s, q, u = EXPLAINED, 0.0, 0.0, 0.0, 0.0
+        yield a, i, j, kind, max(z, LEAST_Z), d, s, q, u, mover
 
 
-def _stands(
-    model: SceneModel,
-    posterior: Posterior,
-    scene: Scene,
-    supports: Sequence[tuple[int, int]],
-    heights: Heights | None,
-) -> tuple[Int[Indices, "N"], Float[Floats, "N"], Float[Floats, "N"]]:
-    """Return the stand of each object, its log p, and log q of its supporter.
-
-    The values are 0 for an unknown stand, and log p without poses. `supports` has pairs (i, j) of
-    objects with i on or in j. `heights` is None without poses.
-    """
-    present, places = posterior.present, model.places
-    stands, zeros = np.full(len(present.row), UNKNOWN), np.zeros(len(present.row))
-    if places is None:
-        return stands, zeros, zeros
-    listed = model.vocabulary.stand_in[present.classes]
-    classes = listed[present.row]
-    stand_shares = places.stands[classes].astype(np.float64)
-    if heights is not None and scene.relations is not None:
-        floor = floor_level(heights.bottoms, stand_shares[:, FLOOR])
-        stands = stands_of(*scene.relations.grids(len(classes)), heights, floor)
-    else:
-        stands[[i for i, _ in supports]] = SUPPORTED
-    if (stands == UNKNOWN).all():
-        return stands, zeros, zeros
-    by_class = places.supporters(classes, listed)
-    by_class[:, model.vocabulary.structure[present.classes]] = 0.0
-    is_supported = stands == SUPPORTED
-    q = np.where(is_supported, 0.0, 1.0)
-    for i, j in supports:
-        if is_supported[i]:
-            q[i] = max(q[i], by_class[i, present.row[j]])
-    log_q = np.log(np.maximum(q, _LEAST_P))
-    if heights is None:
-        return stands, zeros, log_q
-    stand_shares[:, HANGS] += stand_shares[:, SUPPORTED] * (1 - by_class.sum(1))
-    p = np.where(stands == UNKNOWN, 1.0, stand_shares[np.arange(len(stands)), stands])
-    return stands, np.log(np.maximum(p, _LEAST_P)), log_q
+def _posed(model: SceneModel, posterior: Posterior, scene: Scene) -> Iterator[_Entry]:
+    """Yield the entry of each object with a box. A confirmed support has no other evidence."""
+    if model.places is None:
+        return
+    evidence, holding = _Evidence(model, posterior), {*scene.triples}
+    at = _standing(model, scene, evidence)
+    for i, (reason, j) in enumerate(zip(at.reason.tolist(), at.anchor.tolist(), strict=True)):
+        on_object = reason == ON_OBJECT
+        if reason < 0 or not evidence.is_thing[i] or (j >= 0 and not evidence.is_thing[j]):
+            continue
+        if not on_object:
+            if evidence.moves[i]:
+                relation, kind, _ = _REASONS[reason]
+                yield relation, i, j, kind, 0.0, 0.0, -at.log_ratio[i], 0.0, 0.0, i
+            continue
+        a = INSIDE if (INSIDE, i, j) in holding else ON_TOP
+        (z, u), d, q = evidence.support(a, i, j), evidence.d(a, i, j), evidence.q(i, j)
+        s = -at.log_ratio[i]
+        if not evidence.moves[i]:
+            s = q = 0.0
+        if evidence.is_confirmed(a, i, j):
+            z, d, s, q, u = EXPLAINED, 0.0, 0.0, 0.0, 0.0
+        yield a, i, j, HELD, z, d, s, q, u, i
 
 
-def _heights(model: SceneModel, scene: Scene, classes: Indices) -> Heights:
-    """Return the heights of the objects. Furniture whose box is only its top reaches down."""
-    centres, extents = boxes_of(scene.objects, model.vocabulary.sizes)
-    heights, places = Heights.of(centres, extents), model.places
-    if places is None:
-        return heights
-    heights_of_class, tops = model.vocabulary.sizes[classes, 2], heights.tops
-    is_top = (places.stands[classes, FLOOR] >= USUAL) & (extents[:, 2] < heights_of_class / 2)
-    bottoms = np.where(is_top, np.fmin(heights.bottoms, tops - heights_of_class), heights.bottoms)
-    return Heights(bottoms, tops, heights.areas)
+def _standing(model: SceneModel, scene: Scene, evidence: _Evidence) -> Standing:
+    """Return what the boxes of a scene say. Furniture whose box is only its top reaches down."""
+    vocabulary, shares = model.vocabulary, evidence.stands
+    centres, extents = boxes_of(scene.objects, vocabulary.sizes)
+    errors = errors_of(scene.objects, extents, evidence.classes, model.spread)
+    usual_height = vocabulary.sizes[evidence.classes, 2]
+    is_top = (shares[:, FLOOR] >= USUAL) & (extents[:, 2] < usual_height / 2)
+    bottoms = centres[:, 2] - extents[:, 2] / 2
+    floor = floor_level(bottoms, np.where(is_top, 0.0, shares[:, FLOOR]), errors[:, 1])
+    reached = np.fmax(bottoms + extents[:, 2] - usual_height, floor)
+    longer = np.where(is_top, np.fmax(bottoms - reached, 0.0), 0.0)
+    centres[:, 2] -= longer / 2
+    extents[:, 2] += longer
+    unlisted = np.maximum(1.0 - evidence.supporters.sum(1), 0.0)
+    supporters = np.ascontiguousarray(evidence.supporters[:, evidence.row])
+    yaws = np.array([thing.yaw for thing in scene.objects])
+    boxes = centres, extents, yaws, errors
+    within = np.zeros(len(shares))
+    if model.places is not None:
+        within = model.places.within[evidence.classes].astype(np.float64)
+    return Standing(*standing(boxes, floor, shares, supporters, unlisted, within))
 
 
-def wrong_log_odds(judgement: Judgement, terms: Float[Floats, "n 4"]) -> Float[Floats, "n"]:
+def wrong_log_odds(judgement: Judgement, terms: Float[Floats, "n 6"]) -> Float[Floats, "n"]:
     """Return the log-odds that entries of one kind are wrong."""
-    weights = np.array([judgement.relation, judgement.change, judgement.stand, judgement.supporter])
+    weights = np.array([getattr(judgement, name) for name in WEIGHTS])
     return judgement.intercept + terms @ weights
 
 
@@ -245,26 +299,25 @@ def _judged(model: SceneModel, entries: Entries) -> Iterator[tuple[Judgement, In
 def misplaced_fields(
     model: SceneModel, posterior: Posterior, scene: Scene, sensitivity: Sensitivity
 ) -> list[Fields]:
-    """Judge the observed relations, and the objects that nothing supports.
+    """Judge the stated relations, or the places of boxes.
 
-    Every relation of a kind that the model judges is listed, without structure. An object on the
-    floor, or hanging above it, is listed only if it reaches the most sensitive alarm line. The most
-    probably wrong entry comes first. Equal probabilities keep the order of `Scene.triples`. An
-    object under another object is the subject of its entry.
+    Every stated relation, and every support of boxes, of a kind that the model judges is listed,
+    without structure. Other entries about boxes need at least `LEAST_LISTED`, or an alarm. The most probably wrong entry comes first. Equal probabilities keep the order of
+    `Scene.triples`, or of the objects. An object under another object is the subject of its entry.
     `scene_client.schemas.MisplacedRelation` defines the fields.
     """
     entries = entries_of(model, posterior, scene)
     n = len(entries.kind)
     if not n:
         return []
-    log_odds, line, lowest = np.full(n, -np.inf), np.full(n, np.inf), np.full(n, np.inf)
+    log_odds, line = np.full(n, -np.inf), np.full(n, np.inf)
     for judgement, rows, values in _judged(model, entries):
         log_odds[rows] = values
         line[rows] = getattr(judgement.lines, sensitivity).threshold(len(rows))
-        lowest[rows] = judgement.lines.high.threshold(len(rows))
-    p, is_relation = sigmoid(log_odds), (entries.kind != STAND) & (log_odds > -np.inf)
+    always = (entries.kind < POSED) | (entries.kind == HELD)
+    p, is_relation = sigmoid(log_odds), always & (log_odds > -np.inf)
     order = np.argsort(-log_odds, kind="stable")
-    order = order[(is_relation | (p >= np.minimum(line, lowest)))[order]]
+    order = order[(is_relation | (p >= np.minimum(line, LEAST_LISTED)))[order]]
     ids = [thing.id for thing in scene.objects]
     columns = (
         *(entries.triple[order].tolist(), entries.kind[order].tolist()),
@@ -281,9 +334,10 @@ def misplaced_fields(
             {
                 "subject": ids[subject],
                 "relation": name,
-                "object": ids[object_] if kind != STAND else THE_FLOOR,
+                "object": ids[object_] if object_ >= 0 else THE_FLOOR,
                 "probability": probability,
                 "is_misplaced": is_misplaced,
+                "reason": _REASON_OF.get((relation, kind), "relation"),
                 "moved": ids[mover],
             }
         )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from app.compiling import compiled
 from app.inference.elementary import NO_UNIT
 from app.model.scene_model import SceneModel
-from app.model.statistics import UNOBSERVED, add_unseen, rotated_offsets
+from app.model.statistics import UNOBSERVED, rotated_offsets
 from app.questions.answer import Fields, best, significant
 from app.questions.posterior import Posterior, exclusive, relation_probability
 from app.scene.scene import Scene, boxes_of
@@ -96,8 +96,6 @@ def placements(
             first = ((0 if at.outgoing else A) + at.relation) * len(anchors) + column
             objects[column] = at.anchor
     things = [scene.objects[number] for number in objects.tolist()]
-    if A > ON_TOP and model.places is not None:
-        add_unseen(*model.places.unseen, candidates, classes, forward, backward)
     if A > INSIDE:
         sizes = model.vocabulary.sizes
         has_sizes = any(thing.size is not None for thing in things)

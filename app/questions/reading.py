@@ -14,6 +14,10 @@ from itertools import compress, count
 from statistics import median
 from typing import Final
 
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
 from app.errors import ContradictionError, InvalidRequestError, Location
 from app.questions.names import ErrorList, LookUps, Names, Unknown
 from app.scene.relation_table import RelationTable, Triple
@@ -74,6 +78,7 @@ def read_scene(
     look_ups: LookUps | None = None,  # shared by all scenes of a batch
     *,
     roles: RoleCounts | None = None,  # see `derive_relations`
+    spread: Float[NDArray[np.floating], "V"] | None = None,  # see `observe`
     profiles: Sequence[str] = (),  # names of the model's profiles
     may_be_empty: bool = False,  # whether a scene without objects of known classes is valid
 ) -> Reading:
@@ -121,6 +126,7 @@ def read_scene(
             viewpoint=None if view is None else Viewpoint(view.x, view.y, view.yaw),
             has_viewer=view is not None or not is_world_fixed(request.frame_id),
             typical_sizes=vocabulary.sizes,
+            spread=spread,
             stand_in=vocabulary.stand_in,
             roles=roles,
         )

@@ -26,6 +26,7 @@ from app.questions.placements import supported_objects
 from app.questions.posterior import Posterior, Present, exclusive, relation_probability
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
 from app.questions.reading import Reading
+from app.scene.relation_table import POSSIBLE
 from app.scene.scene import Scene
 from app.scene.spatial_relations import (
     CANONICAL,
@@ -144,7 +145,7 @@ def _evidence(
         excluded[a, supported] = True
     evidence = np.where(excluded[:A], _EXCLUDED, np.float32(np.nan))
     confidence = np.array([thing.confidence for thing in scene.objects], np.float32)
-    observed = holds.known(A)
+    observed = table.rows(table.probability >= POSSIBLE).known(A)
     p = observed.probability * confidence[observed.subject] * confidence[observed.object]
     evidence[observed.relation, observed.subject, observed.object] = p
     return evidence

@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from app.inference import MachineSpec, Weights
 from app.inference.objects import LARGEST_WEIGHT
 from app.inference.weights import layout
-from app.model import Counts, Offsets, Places, SceneModel
+from app.model import Counts, Offsets, Places, Possibility, SceneModel
+from app.model.fields import TensorGroup
 from app.registry.card import render_card
 from app.registry.description import Description
 from app.registry.durable import read_file, sync_directory, write_file
@@ -33,6 +34,7 @@ MAX_WEIGHTS_BYTES: Final = 2**30
 """Default maximum size of the weights file in bytes."""
 
 _DTYPES: Final = {float: "float32", int: "int32"}
+_GROUPS: Final[tuple[type[TensorGroup], ...]] = (Offsets, Counts, Places, Possibility)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +70,8 @@ def write_artifact(
 ) -> Manifest:
     """Write an artifact into a new directory, whose parent exists, and sync it to disk.
 
-    ``state`` has the arrays of `layout`, and optionally those of `Offsets.tensors()`,
-    `Counts.tensors()` and `Places.tensors()`; see `pack` for ``storage_dtype``.
+    ``state`` has the arrays of `layout`, and optionally the tables of a `SceneModel`; see
+    `pack` for ``storage_dtype``.
 
     Raises:
         ArtifactError: the artifact format cannot store a tensor; see `pack`.
@@ -126,19 +128,17 @@ def load_artifact(
 
 def _model(manifest: Manifest, tensors: dict[str, NDArray[Any]]) -> SceneModel:
     """Return the model of the tensors by name: its weights and its tables of statistics."""
-    offsets, counts, places = (
+    tables = [
         {name: tensors.pop(name) for name in list(tensors) if name.startswith(group.prefix)}
-        for group in (Offsets, Counts, Places)
-    )
+        for group in _GROUPS
+    ]
     weights = _weights(manifest, tensors)
     sizes = weights.spec.A, weights.spec.V, len(manifest.vocabulary.room_types)
     return SceneModel(
         weights,
         manifest.vocabulary.vocabulary(),
         manifest.calibration,
-        read_group(Offsets, offsets, *sizes),
-        read_group(Counts, counts, *sizes),
-        read_group(Places, places, *sizes),
+        *(read_group(group, table, *sizes) for group, table in zip(_GROUPS, tables, strict=True)),
     )
 
 

@@ -18,7 +18,7 @@ from app.model.statistics import Counts, Offsets, Places
 from app.registry.description import Description
 from app.registry.errors import ArtifactError, Code
 
-FORMAT: Final = 10
+FORMAT: Final = 11
 MAX_TENSORS: Final = 10_000
 WEIGHTS: Final = "model.safetensors"
 CARD: Final = "card.md"
@@ -50,7 +50,7 @@ class FileEntry(Frozen):
 class Manifest(Description):
     """The description of a model, its stored tensors and the checksums of its other files."""
 
-    format: Literal[10] = FORMAT
+    format: Literal[11] = FORMAT
     tensors: Annotated[dict[str, TensorEntry], Field(max_length=MAX_TENSORS)]
     files: dict[str, FileEntry]
 

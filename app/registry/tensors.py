@@ -110,8 +110,7 @@ def read_group(
         for name in shapes:
             kind = np.integer if name in group.integers else np.floating
             is_right = np.issubdtype(getattr(tables, name).dtype, kind)
-            stored = group.stored_as.get(name, name)
-            tables.require(is_right, f"{stored} must have a dtype of {kind.__name__}")
+            tables.require(is_right, f"{name} must have a dtype of {kind.__name__}")
         tables.check(A, V, C)
     except ValueError as error:
         raise ArtifactError("invalid_tensor", str(error)) from None

@@ -1,7 +1,8 @@
 """The relations of a scene in one table: stated by a request, shown by boxes, or excluded by boxes.
 
 A request is read into this table once, and all questions read the table. A row is a relation of one
-object to another object. Its probability is 1 if the relation holds, and 0 if it does not hold.
+object to another object, with its probability: 1 or 0 for a stated relation, and between them for
+one of boxes, which have errors. A relation holds if its probability is at least `HOLDS`.
 """
 
 from collections.abc import Iterable, Sequence
@@ -23,6 +24,9 @@ STATED, BOXES, EXCLUDED = range(3)
 """Origins of a row. The first two are observations: the request states the relation or that it does
 not hold, or the boxes show this. A row of origin `EXCLUDED` observes nothing about other relations:
 its relation alone cannot hold between these boxes."""
+
+HOLDS: Final = 0.5  # minimum probability of a relation that holds
+POSSIBLE: Final = 0.01  # minimum probability of a relation that the boxes do not exclude
 
 _A: Final = len(CANONICAL)
 _COLUMNS: Final = ("relation", "subject", "object", "probability", "origin", "is_opposite")
@@ -62,14 +66,14 @@ class RelationTable:
     @classmethod
     def shown_by_boxes(
         cls,
-        holds: Bool[Array, "A N N"],
+        probability: Float32[Array, "A N N"],
         observed: Bool[Array, "A N N"],
         excluded: Bool[Array, "A N N"],  # relations that cannot hold, observed or not
     ) -> "RelationTable":
         """Return the table of the relations between N boxes."""
         a, i, j = _between_two(observed | excluded)
         origin = np.where(observed[a, i, j], BOXES, EXCLUDED)
-        p = holds[a, i, j].astype(np.float32)
+        p = probability[a, i, j]
         return cls(a, i, j, p, origin, np.zeros(len(p), np.bool_), of_boxes=True)
 
     def excluding(self, grid: Bool[Array, "A N N"], origin: int) -> "RelationTable":
@@ -100,7 +104,7 @@ class RelationTable:
     @cached_property
     def holding(self) -> "RelationTable":
         """The relations that hold, in the order of the request or of their indices."""
-        return self.rows(self.probability > 0)
+        return self.rows(self.probability >= HOLDS)
 
     @cached_property
     def triples(self) -> tuple[Triple, ...]:
@@ -119,7 +123,7 @@ class RelationTable:
         holds, observed = np.zeros((2, _A, N, N), np.bool_)
         seen = self.rows(self.origin != EXCLUDED)
         cells = seen.relation, seen.subject, seen.object
-        observed[cells], holds[cells] = True, seen.probability > 0
+        observed[cells], holds[cells] = True, seen.probability >= HOLDS
         return holds, observed
 
     def of_classes(

@@ -8,22 +8,26 @@ Viewer axes point away from the viewer (x), to the left (y) and up (z). Units ar
 radians. Boxes are upright. The footprint of a box is the rectangle of its horizontal extents,
 rotated by the yaw.
 
-1. *on-top*(i, j) holds if the footprints overlap by at least 30 % of the smaller footprint, and the
-   bottom of i is within 5 cm of the top of j. Box i must not surround box j. If two thin boxes meet
-   this rule in both directions, only the box with the higher centre is on top. If both centres have
-   the same height, neither box is on top. A box surrounds a smaller box if it is more than 10 cm
-   high, and if it reaches both lower and higher than the smaller box.
-2. *above*(i, j) holds if the footprints overlap by at least 30 % of the smaller footprint, and the
-   bottom of i is more than 5 cm above the top of j.
-3. Two boxes reach into each other if two conditions hold. The footprints overlap by at least 30 %
-   of the smaller footprint. The bottom of each box is more than 5 cm below the top of the other, or
-   one box surrounds the other. The smaller box is the box with the smaller footprint. If the
-   footprints differ by at most 1 %, it is the box with the smaller volume. The smaller box has one
-   of three roles:
+Positions and sizes have errors, so each relation has a probability. A relation holds if its
+probability is at least .5. s is the standard deviation of the vertical distance of two faces, and
+at least `SMALLEST_STD`. The lift of a box over a lower box is its bottom minus the top of the lower
+box. Rules 1 to 3 apply to two boxes whose footprints overlap by at least 30 % of the smaller one:
+
+1. The upper box, with the higher centre, touches the lower box, is above it, or reaches into it.
+   The three cases have the weights `TOUCH` · N(lift; 0, s), Φ(lift / s) and Φ(-lift / s). So two
+   boxes without errors touch if the lift is at most 5 cm. A box that surrounds a smaller box does
+   not touch it. A box surrounds a smaller box if it is more than 10 cm high, and if it reaches both
+   lower and higher than the smaller box.
+2. If the upper box touches the lower box, *on-top* holds if the lower box carries the upper box.
+   Otherwise *above* holds. A box carries every box with a smaller footprint, and each larger box
+   whose centre is over it.
+3. The roles of two boxes that reach into each other depend on the smaller box, the box with the
+   smaller footprint. If the footprints differ by at most 1 %, it is the box with the smaller
+   volume. The smaller box has one of three roles:
 
    - on the larger box: *on-top*(smaller, larger). The bottom of the smaller box must be at least
      20 % of the larger height above the bottom of the larger box.
-   - under the larger box: *on-top*(larger, smaller). The bottom of the smaller box must be at
+   - under the larger box: *above*(larger, smaller). The bottom of the smaller box must be at
      most 10 cm, or at most 20 % of the larger height, above the bottom of the larger box.
    - in the larger box: *inside*(smaller, larger). The smaller box must have at most 1.2 times the
      larger height.
@@ -31,10 +35,11 @@ rotated by the yaw.
    The counts of `app.scene.roles` choose one of the possible roles, or leave the role undecided.
    Without counts, without classes, or if the volumes also differ by at most 1 %, the role is
    undecided.
-4. If rules 1 to 3 do not apply to two neighbours, their centres decide. dx and dy are the
+4. If no stacked relation holds between two neighbours, their centres decide. dx and dy are the
    differences of the centres. If |dy| is at least |dx|, the box with the larger y is *left* of the
    other box. If |dx| is larger, the box with the smaller x, nearer to the viewer, is in *front* of
-   the other box. If both |dx| and |dy| are under 10 cm, neither relation holds.
+   the other box. If both |dx| and |dy| are under 10 cm, neither relation holds. The probability is
+   that of the less certain of both conditions, if no stacked relation holds.
 5. Two boxes are neighbours if their footprints are at most 1 m apart. If the size of a box is
    unknown, the centres must be at most 1.5 m apart in the horizontal plane.
 6. All relations between two neighbours are observed, whether they hold or not. So if a stacked
@@ -59,17 +64,21 @@ from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float32, Int
 from numpy.typing import ArrayLike, NDArray
 
-from app.compiling import compiled
+from app.compiling import compiled, inlined
 from app.scene.footprints import measure
-from app.scene.relation_table import EXCLUDED, RelationTable, Triple
-from app.scene.roles import IN, ON, UNDER, RoleCounts, is_smaller, likely_role, possible_roles
+from app.scene.relation_table import EXCLUDED, HOLDS, POSSIBLE, RelationTable, Triple
+from app.scene.roles import IN, ON, SAME, UNDER, RoleCounts, is_smaller, likely_role, possible_roles
 from app.scene.spatial_relations import ABOVE, CANONICAL, FRONT, INSIDE, LEFT, ON_TOP
 
 MIN_OVERLAP: Final = 0.30  # minimum overlap as a share of the smaller footprint
-CONTACT: Final = 0.05  # maximum distance in metres between bottom and top for *on-top*
+CONTACT: Final = 0.05  # maximum lift in metres at which two boxes without errors touch
+SMALLEST_STD: Final = 0.02  # minimum standard deviation in metres of a lift
+POSITION_STD: Final = 0.05  # standard deviation in metres of a position without a stated one
+SIZE_STD: Final = 0.1  # standard deviation of a stated size without its own, as a share of it
+SPREAD: Final = 0.35  # standard deviation of the log of the sizes of a class without its own
 NEIGHBOUR_GAP: Final = 1.0  # maximum distance in metres between the footprints of neighbours
 NEIGHBOUR_DISTANCE: Final = 1.5  # maximum distance in metres between centres if a size is unknown
 MIN_OFFSET: Final = 0.10  # minimum |dx| or |dy| in metres for *front* or *left*
@@ -77,6 +86,11 @@ UNKNOWN_REACH: Final = 1.5  # maximum reach in metres of a footprint of unknown 
 MOST_DISTANT: Final = 100.0  # longest plausible distance from the viewer in metres; detects mm
 SMALLEST: Final = 1e-3  # shortest plausible longest side of a box in metres
 LARGEST: Final = 20.0  # longest plausible side of a box in metres
+
+_SQRT_2: Final = math.sqrt(2.0)
+_SQRT_2_PI: Final = math.sqrt(2.0 * math.pi)
+TOUCH: Final = SMALLEST_STD * _SQRT_2_PI * math.exp(0.5 * (CONTACT / SMALLEST_STD) ** 2)
+"""Weight of touching in metres: without errors, it equals that of a gap at a lift of `CONTACT`."""
 
 Point = tuple[float, float, float]
 
@@ -94,6 +108,8 @@ class SceneObject:
     position: Point | None = None  # centre (x, y, z) in viewer axes: x away, y left, z up
     size: Point | None = None  # extents (x, y, z) before the rotation
     yaw: float = 0.0  # rotation about z in radians
+    position_std: float | None = None  # standard deviation of each coordinate
+    size_std: float | None = None  # standard deviation of each extent
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +182,7 @@ def observe(
     viewpoint: Viewpoint | None = None,  # None: at the origin, looking along x
     has_viewer: bool = True,  # False: left and front are undefined
     typical_sizes: Float[NDArray[np.float64], "V 3"] | None = None,  # `Vocabulary.sizes`
+    spread: Float[NDArray[np.floating], "V"] | None = None,  # of log sizes; None: `SPREAD`
     stand_in: Int[NDArray[np.int64], "V"] | None = None,  # `Vocabulary.stand_in`; None: itself
     roles: RoleCounts | None = None,  # see `derive_relations`
 ) -> Scene:
@@ -188,15 +205,16 @@ def observe(
         points,
         sizes,
         [thing.yaw for thing in objects],
+        errors=errors_of(objects, sizes, classes, spread),
         horizontal=has_viewer,
         classes=classes,
         roles=roles,
     )
     far = excluded_by_centres(points, sizes, horizontal=has_viewer)
     if scene.relations is not None:
-        excluded = far | (poses.observed & ~poses.holds)
+        excluded = far | (poses.observed & (poses.probability < POSSIBLE))
         return replace(scene, relations=scene.relations.excluding(excluded, EXCLUDED))
-    table = RelationTable.shown_by_boxes(poses.holds, poses.observed, far)
+    table = RelationTable.shown_by_boxes(poses.probability, poses.observed, far)
     return replace(scene, objects=objects, relations=table)
 
 
@@ -230,6 +248,31 @@ def boxes_of(
     return centres, extents
 
 
+def errors_of(
+    objects: Sequence[SceneObject],
+    extents: Float[NDArray[np.float64], "n 3"],  # stated, or typical
+    classes: Int[NDArray[np.int64], " n"],  # -1 where unknown
+    spread: Float[NDArray[np.floating], "V"] | None,  # standard deviations of log sizes
+) -> Float[NDArray[np.float64], "n 2"]:
+    """Return standard deviations in metres: of the centres, and of the faces at bottom and top.
+
+    The error of a face is that of the centre and of half of the height. Without stated values, a
+    position has `POSITION_STD`, a stated size `SIZE_STD`, and a typical size that of its class.
+    """
+    errors = np.empty((len(objects), 2))
+    columns = objects, classes.tolist(), extents[:, 2].tolist()
+    for row, (thing, index, height) in enumerate(zip(*columns, strict=True)):
+        centre, of_height = thing.position_std, thing.size_std
+        if centre is None:
+            centre = POSITION_STD
+        if of_height is None:
+            is_described = spread is not None and index >= 0
+            share = float(spread[index]) if is_described else SPREAD  # type: ignore[index]
+            of_height = height * (share if thing.size is None else SIZE_STD)
+        errors[row] = centre, math.hypot(centre, of_height / 2)
+    return errors
+
+
 Rows = Float[NDArray, "n 3"] | Sequence[Sequence[float]]
 
 
@@ -245,9 +288,14 @@ class Viewpoint(NamedTuple):
 class PoseRelations:
     """Relations a(i, j) between n objects, derived from poses, at [a, i, j]."""
 
-    holds: Bool[NDArray, "A n n"]
+    probability: Float32[NDArray, "A n n"]
     # Whether it was observed if a relation holds. Symmetric in i and j, except for undecided roles.
     observed: Bool[NDArray, "A n n"]
+
+    @property
+    def holds(self) -> Bool[NDArray, "A n n"]:
+        """The relations with a probability of at least `HOLDS`."""
+        return self.probability >= HOLDS
 
 
 def to_viewer_frame(
@@ -274,6 +322,7 @@ def derive_relations(
     sizes: Rows,  # extents before the rotation, in metres; 0 for flat boxes, NaN where unknown
     yaws: ArrayLike | None = None,  # rotations about z in radians; all 0 by default
     *,
+    errors: Float[NDArray, "n 2"] | None = None,  # see `errors_of`; all 0 by default
     horizontal: bool = True,  # whether the viewer is known; if not, left and front are unobserved
     classes: Int[NDArray, " n"] | None = None,  # -1 where unknown
     roles: RoleCounts | None = None,  # for rule 3; None leaves all roles undecided
@@ -289,6 +338,7 @@ def derive_relations(
         np.asarray(rows, np.float64, order="C").reshape(n, 3) for rows in (positions, sizes)
     )
     turns = np.zeros(n) if yaws is None else np.asarray(yaws, np.float64, order="C").reshape(n)
+    deviations = np.zeros((n, 2)) if errors is None else errors.reshape(n, 2)
     if np.isinf(points).any() or np.isinf(extents).any() or not np.isfinite(turns).all():
         raise ValueError("positions, sizes and yaws must not be infinite, and yaws must not be NaN")
     if np.any(extents < 0):
@@ -297,10 +347,11 @@ def derive_relations(
         classes, roles = np.full(n, -1), _NO_ROLES
     elif classes.shape != (n,) or classes.max(initial=-1) >= len(roles.anchor):
         raise ValueError(f"classes must be {n} indices below {len(roles.anchor)}")
-    holds = np.zeros((len(CANONICAL), n, n), dtype=np.bool_)
-    observed = np.zeros_like(holds)
-    _relate_all(points, extents, turns, horizontal, classes, roles, holds, observed)
-    return PoseRelations(holds, observed)
+    probability = np.zeros((len(CANONICAL), n, n), np.float32)
+    observed = np.zeros(probability.shape, np.bool_)
+    boxes = points, extents, turns, deviations
+    _relate_all(boxes, horizontal, classes, roles, probability, observed)
+    return PoseRelations(probability, observed)
 
 
 _NO_ROLES: Final = RoleCounts(
@@ -326,18 +377,23 @@ def excluded_by_centres(
     return excluded
 
 
+Boxes = tuple[
+    Float[NDArray, "n 3"], Float[NDArray, "n 3"], Float[NDArray, " n"], Float[NDArray, "n 2"]
+]  # fmt: skip
+"""Centres, extents, yaws, and standard deviations (`errors_of`) of n boxes."""
+
+
 @compiled
 def _relate_all(
-    points: Float[NDArray, "n 3"],
-    extents: Float[NDArray, "n 3"],
-    turns: Float[NDArray, " n"],
+    boxes: Boxes,
     horizontal: bool,
     classes: Int[NDArray, " n"],
     roles: RoleCounts,
-    holds: Bool[NDArray, "A n n"],
+    probability: Float32[NDArray, "A n n"],
     observed: Bool[NDArray, "A n n"],
 ) -> None:
     """Write the relations of all pairs of boxes. Left and front need `horizontal`, a viewer."""
+    points, extents, turns, errors = boxes
     n = len(points)
     has_position, has_size = np.empty(n, np.bool_), np.empty(n, np.bool_)
     radius = np.empty(n)
@@ -350,83 +406,127 @@ def _relate_all(
             if not (has_position[i] and has_position[j]):
                 continue
             distance = math.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1])
-            have_sizes, overlap = has_size[i] and has_size[j], False
+            have_sizes, stacked = has_size[i] and has_size[j], 0.0
             if not have_sizes:
-                neighbours = distance <= NEIGHBOUR_DISTANCE
+                neighbours, share = distance <= NEIGHBOUR_DISTANCE, 0.0
             # The distance between the circles around the footprints is a fast first check, because
             # `measure` is slower.
             elif distance - radius[i] - radius[j] <= NEIGHBOUR_GAP:
                 share, gap = measure(
                     points[i], extents[i], turns[i], points[j], extents[j], turns[j]
                 )
-                neighbours, overlap = gap <= NEIGHBOUR_GAP, share >= MIN_OVERLAP
+                neighbours = gap <= NEIGHBOUR_GAP
             else:
-                neighbours = False
+                neighbours, share = False, 0.0
             # The order of relation indices is left, front, on-top, above, inside.
             first = LEFT if neighbours and horizontal else ON_TOP
             last = INSIDE if have_sizes else FRONT
             for relation in range(first, last + 1):
                 observed[relation, i, j] = observed[relation, j, i] = True
-            if overlap and _stack(points, extents, i, j, classes, roles, holds, observed):
-                continue
-            if neighbours and horizontal:
+            error = math.hypot(errors[i, 0], errors[j, 0])
+            if share > 0.0:
+                smaller = min(extents[i, 0] * extents[i, 1], extents[j, 0] * extents[j, 1])
+                overlap = normal_share((share - MIN_OVERLAP) * math.sqrt(smaller), error)
+                if overlap >= POSSIBLE:
+                    stacked = _stack(
+                        boxes, i, j, overlap, classes, roles, probability, observed
+                    )
+            if neighbours and horizontal and stacked < HOLDS:
                 for subject, anchor in ((i, j), (j, i)):
                     to_front = points[anchor, 0] - points[subject, 0]
                     to_left = points[subject, 1] - points[anchor, 1]
+                    relation, offset = FRONT, to_front
                     if abs(to_left) >= abs(to_front):
-                        holds[LEFT, subject, anchor] = to_left >= MIN_OFFSET
-                    else:
-                        holds[FRONT, subject, anchor] = to_front >= MIN_OFFSET
+                        relation, offset = LEFT, to_left
+                    if offset > 0:
+                        is_offset = normal_share(offset - MIN_OFFSET, error)
+                        margin = abs(abs(to_left) - abs(to_front)) / math.sqrt(2.0)
+                        p = min(is_offset, normal_share(margin, error))
+                        probability[relation, subject, anchor] = (1.0 - stacked) * p
+
+
+@inlined
+def normal_share(margin, error):
+    """Return the probability that a margin with a normal error (standard deviation) is not < 0."""
+    if error <= 0.0:
+        return 1.0 if margin >= 0.0 else 0.0
+    return 0.5 + 0.5 * math.erf(margin / (error * _SQRT_2))
+
+
+@compiled
+def contact_weights(lift: float, error: float) -> tuple[float, float, float]:
+    """Return the weights of rule 1 for a lift in metres: touching, above, and reaching into."""
+    s = max(error, SMALLEST_STD)
+    touch = TOUCH * math.exp(-0.5 * (lift / s) ** 2) / (s * _SQRT_2_PI)
+    above = 0.5 + 0.5 * math.erf(lift / (s * _SQRT_2))
+    return touch, above, 1.0 - above
+
+
+@compiled
+def _carries(boxes: Boxes, subject: int, anchor: int) -> bool:
+    """Return whether the anchor carries a box on it: a smaller one, or one centred over it."""
+    points, extents, turns, errors = boxes
+    area = extents[anchor, 0] * extents[anchor, 1]
+    if extents[subject, 0] * extents[subject, 1] <= area * (1.0 + SAME):
+        return True
+    dx, dy = points[subject, 0] - points[anchor, 0], points[subject, 1] - points[anchor, 1]
+    cos, sin = math.cos(turns[anchor]), math.sin(turns[anchor])
+    margin = math.hypot(errors[subject, 0], errors[anchor, 0])
+    across, along = abs(cos * dx + sin * dy), abs(cos * dy - sin * dx)
+    return across <= extents[anchor, 0] / 2 + margin and along <= extents[anchor, 1] / 2 + margin
 
 
 @compiled
 def _stack(
-    points: Float[NDArray, "n 3"],
-    extents: Float[NDArray, "n 3"],
+    boxes: Boxes,
     i: int,
     j: int,
+    overlap: float,  # probability that the footprints overlap
     classes: Int[NDArray, " n"],
     roles: RoleCounts,
-    holds: Bool[NDArray, "A n n"],
+    probability: Float32[NDArray, "A n n"],
     observed: Bool[NDArray, "A n n"],
-) -> bool:
-    """Apply rules 1 to 3 to two boxes with overlapping footprints. Return whether one applies."""
-    smaller, larger, is_nested, is_deep = -1, -1, False, True
+) -> float:
+    """Apply rules 1 to 3 to two boxes. Return the probability that they are stacked."""
+    points, extents, _, errors = boxes
+    smaller, larger, is_nested = -1, -1, False
     for one, other in ((i, j), (j, i)):
         if is_smaller(extents[one], extents[other]):
             smaller, larger = one, other
     height, larger_height = extents[smaller, 2], extents[larger, 2]
     rise = points[smaller, 2] - height / 2 - (points[larger, 2] - larger_height / 2)
-    if smaller >= 0:  # the larger box may surround the smaller box; see rule 1
+    if smaller >= 0:  # the larger box may surround the smaller box
         tops = points[smaller, 2] + height / 2, points[larger, 2] + larger_height / 2
         is_nested = rise > 0 and tops[1] > tops[0] and larger_height > 2 * CONTACT
-    for subject, anchor in ((i, j), (j, i)):
-        bottom = points[subject, 2] - extents[subject, 2] / 2
-        lift = bottom - (points[anchor, 2] + extents[anchor, 2] / 2)
-        is_deep = is_deep and lift < -CONTACT
-        is_higher = points[subject, 2] > points[anchor, 2]
-        if lift > CONTACT:
-            holds[ABOVE, subject, anchor] = True
-            return True
-        if lift >= -CONTACT and is_higher and not (is_nested and subject == larger):
-            holds[ON_TOP, subject, anchor] = True
-            return True
-    if not is_deep and not is_nested:
-        return False  # two thin boxes at the same height
+    upper, lower = (i, j) if points[i, 2] > points[j, 2] else (j, i)
+    lift = points[upper, 2] - extents[upper, 2] / 2 - (points[lower, 2] + extents[lower, 2] / 2)
+    if points[i, 2] == points[j, 2] and lift >= -CONTACT:
+        return 0.0  # two thin boxes at the same height
+    touch, above, deep = contact_weights(lift, math.hypot(errors[i, 1], errors[j, 1]))
+    if is_nested and upper == larger:
+        touch, above, deep = 0.0, 0.0, 1.0
+    total = (touch + above + deep) / overlap
+    touch, above, deep = touch / total, above / total, deep / total
+    if _carries(boxes, upper, lower):
+        probability[ON_TOP, upper, lower] = touch
+    else:
+        above += touch
+    probability[ABOVE, upper, lower] = above
     if smaller < 0:
-        for relation in (ON_TOP, INSIDE):
-            observed[relation, i, j] = observed[relation, j, i] = False
-        return True
+        if deep >= HOLDS:
+            for relation in (ON_TOP, INSIDE):
+                observed[relation, i, j] = observed[relation, j, i] = False
+        return overlap
     possible = possible_roles(rise, height, larger_height)
     role = likely_role(roles, classes[smaller], classes[larger], possible)
     if role == ON:
-        holds[ON_TOP, smaller, larger] = True
+        probability[ON_TOP, smaller, larger] += deep
     elif role == UNDER:
-        holds[ON_TOP, larger, smaller] = True
+        probability[ABOVE, larger, smaller] += deep
     elif role == IN:
-        holds[INSIDE, smaller, larger] = True
-    else:  # the relations of the possible roles are unobserved
+        probability[INSIDE, smaller, larger] = deep
+    elif deep >= HOLDS:  # the relations of the possible roles are unobserved
         observed[ON_TOP, smaller, larger] = not possible[ON]
-        observed[ON_TOP, larger, smaller] = not possible[UNDER]
+        observed[ABOVE, larger, smaller] = not possible[UNDER]
         observed[INSIDE, smaller, larger] = not possible[IN]
-    return True
+    return overlap

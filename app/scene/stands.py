@@ -21,21 +21,32 @@ CLEARANCE: Final = 0.10  # maximum height in metres of the bottom of an object o
 CLOSE: Final = 0.15  # maximum gap in metres to an object that may support an object above it
 
 USUAL: Final = 0.5  # share of a stand that is usual for a class
+_UNIFORM: Final = 0.4  # density per metre of heights above the floor
+_ERROR: Final = 0.05  # share of boxes at a wrong height
+_SMALLEST: Final = 0.02  # smallest error in metres
 
 
-def floor_level(bottoms: Float[NDArray, " n"], weights: Float[NDArray, " n"]) -> float:
-    """Return the height of the floor in metres: the lower weighted tertile of bottoms of boxes.
+def floor_level(
+    bottoms: Float[NDArray, " n"], shares: Float[NDArray, " n"], errors: Float[NDArray, " n"]
+) -> float:
+    """Return the likeliest height of the floor in metres, among the bottoms of n boxes.
 
-    The weights are the shares of the objects of each class that stand on the floor. Boxes with a
-    weight below `USUAL` do not count. If all boxes have such a weight, the height is NaN.
+    The bottom of a box is at the floor f with the share S of its class, with a normal error s, or
+    else above it. Boxes below the floor are errors. So f maximises
+
+        Σ log( S · N(bottom - f; 0, s) + (1 - S) · U · [bottom ≥ f - s] + `_ERROR` · U ),  U = .4 / m
+
+    Boxes with S below `USUAL` are no candidates. Without any candidate, the height is NaN.
     """
-    usable = np.isfinite(bottoms) & (weights >= USUAL)
-    bottoms, weights = bottoms[usable], weights[usable]
-    if not len(bottoms):
+    known = np.isfinite(bottoms + errors)
+    bottoms, shares, errors = bottoms[known], shares[known], np.maximum(errors[known], _SMALLEST)
+    candidates = bottoms[shares >= USUAL]
+    if not len(candidates):
         return math.nan
-    order = bottoms.argsort(kind="stable")
-    total = weights[order].cumsum()
-    return float(bottoms[order[total.searchsorted(total[-1] / 3)]])
+    distance = bottoms - candidates[:, None]
+    at_floor = np.exp(-0.5 * (distance / errors) ** 2) / (errors * math.sqrt(2 * math.pi))
+    above = (1 - shares) * _UNIFORM * (distance >= -errors) + _ERROR * _UNIFORM
+    return float(candidates[np.log(shares * at_floor + above).sum(1).argmax()])
 
 
 @dataclass(frozen=True)

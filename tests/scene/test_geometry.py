@@ -106,7 +106,7 @@ STACKS = ALL - HORIZONTAL
         (box(0.0, 0.0, 0.8, *SHEET), box(0.0, 0.05, 0.8, *SHEET), NOTHING, ALL),
         # A tall box is around a smaller one, and no box is around a wider one.
         (BOOK, SHELVES, NOTHING, ALL - {"inside"}),
-        (SHELVES, BOOK, NOTHING, ALL - {"on-top"}),
+        (SHELVES, BOOK, NOTHING, ALL - {"above"}),
         (box(0.0, 0.0, 0.04, 0.3, 0.4, 0.08), BOOK, {"on-top"}, ALL),
         (box(0.0, 0.0, 0.95, 0.1, 0.1, 1.9), BOOK, {"on-top"}, ALL),
         # A rug of no height carries a table.
@@ -145,9 +145,9 @@ FRIDGE = standing(2.0, 0.0, 0.0, 0.65, 0.7, 1.8)
 @pytest.mark.parametrize(
     ("smaller", "larger", "labels", "relation"),
     [
-        (standing(2.1, 0.4, 0.0, 0.3, 0.3, 0.35), DESK_BOX, ("bin", "desk"), "under"),
+        (standing(2.1, 0.4, 0.0, 0.3, 0.3, 0.35), DESK_BOX, ("bin", "desk"), "below"),
         # With its back against the edge, higher than the table.
-        (standing(1.5, 0.3, 0.0, 0.5, 0.45, 0.92), DINING_TABLE, ("chair", "table"), "under"),
+        (standing(1.5, 0.3, 0.0, 0.5, 0.45, 0.92), DINING_TABLE, ("chair", "table"), "below"),
         (standing(2.7, 0.4, 0.5, 0.4, 0.6, 0.15), BED, ("pillow", "bed"), "on-top"),
         (standing(2.0, 0.1, 0.9, 0.09, 0.09, 0.25), FRIDGE, ("milk", "fridge"), "inside"),
     ],

@@ -141,6 +141,7 @@ class TrainingData:
     digest: str = ""  # of the scenes, their vocabulary and split
     words: Float[Tensor, "V D"] | None = None  # unit word vectors of the classes, 0 where unknown
     roles: RoleCounts | None = None  # of the classes in the training scenes
+    possibility: Possibility | None = None  # of the classes
 
     @property
     def parents(self) -> Int[Tensor, "V"]:

@@ -233,11 +233,11 @@ def _relations(
     elif any(thing.box2d is not None for thing in scene.objects):
         relations = derive_from_boxes([thing.box2d or (math.nan,) * 4 for thing in scene.objects])
     else:
-        relations = PoseRelations(*np.zeros((2, A, n, n), dtype=np.bool_))
+        relations = PoseRelations(np.zeros((A, n, n), np.float32), np.zeros((A, n, n), np.bool_))
     _add_supports(relations, scene.objects, classes, roles)
     for subject, relation, anchor in scene.false_relations:
         denied = canonicalise(subject, relation, anchor)
-        relations.holds[denied], relations.observed[denied] = False, True
+        relations.probability[denied], relations.observed[denied] = 0.0, True
     return relations, boxes
 
 
@@ -264,7 +264,8 @@ def _from_lists(
     observed = np.stack([masks[kind] for kind in meaning.unlisted]) | holds | denied
     is_stacked = holds[[*STACKED]].any(0)
     observed |= is_stacked | is_stacked.T
-    return PoseRelations(holds, observed & ~is_contradicted & ~np.eye(n, dtype=np.bool_))
+    observed &= ~is_contradicted & ~np.eye(n, dtype=np.bool_)
+    return PoseRelations(holds.astype(np.float32), observed)
 
 
 def _apply_rules(
@@ -307,13 +308,13 @@ def _add_supports(
         if thing.supported_by is None or (support := index_of[thing.supported_by]) == index:
             continue
         pair = [index, support], [support, index]
-        relations.holds[:, *pair], relations.observed[:, *pair] = False, True
+        relations.probability[:, *pair], relations.observed[:, *pair] = 0.0, True
         lift = lift_of(thing, objects[support])
         role = ON
         if roles is not None and lift is not None and lift < -CONTACT:
             role = likely_role(roles, classes[index], classes[support], _SUPPORTED)
         if role >= 0:
-            relations.holds[ON_TOP if role == ON else INSIDE, index, support] = True
+            relations.probability[ON_TOP if role == ON else INSIDE, index, support] = 1.0
         else:
             relations.observed[[*SUPPORTS], index, support] = False
 
@@ -345,4 +346,4 @@ def derive_from_boxes(boxes: Sequence[Box2d]) -> PoseRelations:
             observed[_IN_THE_IMAGE, i, j] = observed[_IN_THE_IMAGE, j, i] = True
             if (relation := relation_between(boxes[i], boxes[j])) is not None:
                 holds[canonicalise(i, relation, j)] = True
-    return PoseRelations(holds, observed)
+    return PoseRelations(holds.astype(np.float32), observed)

@@ -6,7 +6,8 @@ two objects whose classes never stand on or in each other in the scene.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -18,16 +19,21 @@ from app.scene import Scene
 from app.scene.footprints import overlap_and_gap
 from app.scene.scene import CONTACT
 from app.scene.spatial_relations import ON_TOP, SUPPORTS
+from app.scene.stands import FLOOR
 from training.datasets.array_types import ClassMask, Rng
-from training.datasets.cases import draw_true_relations, scene_of
+from training.datasets.cases import Triple, draw_true_relations, scene_of
 from training.datasets.encoding import EncodedScene
 
 _ATTEMPTS: Final = 50  # random spots that are tried
 _LIFTED: Final = 1 / 3  # share of cases in which an object is lifted from the floor
+_LIFTED_STATED: Final = 1 / 2  # the same share for stated supports
 _LEAST_STEP: Final = 0.3  # minimum height in metres between the old and the new place
 _LEAST_AREA: Final = 0.5  # minimum area under a lifted object, as a share of its footprint
 _REACH: Final = 0.5  # maximum distance in metres between a supporter and an object beside it
 _CENTRAL: Final = 0.25  # half of the share of a top, along each axis, where centres are placed
+_FLOAT: Final = (0.3, 1.0)  # least and largest lift in metres of a floating object
+_SINK: Final = (0.4, 0.9)  # least and largest share of the height of a sunk object that sinks
+_LEAST_SINK: Final = 0.15  # minimum depth in metres
 
 
 def has_boxes(encoded: EncodedScene) -> bool:
@@ -104,6 +110,28 @@ def moved_by_triple(
     return None
 
 
+def stacked_by_triple(
+    encoded: EncodedScene, structure: ClassMask, triples: Sequence[Triple], rng: Rng
+) -> tuple[list[Triple], Triple] | None:
+    """Return true triples with a false support, and the false support; None without any.
+
+    Either an object of the floor is on top of a stranger, or a true support is turned round: the
+    desk is on the lamp. `triples` are true triples that state no "under".
+    """
+    usable = ~structure[encoded.instance_classes]
+    on_floor = usable & (encoded.instance_stands == FLOOR)
+    strange = _strangers(encoded) & usable
+    for i in rng.permutation(np.flatnonzero(on_floor)) if rng.random() < _LIFTED_STATED else ():
+        if len(anchors := np.flatnonzero(strange[i])):
+            false = ON_TOP, int(i), int(rng.choice(anchors))
+            return [*(t for t in triples if {*t[1:]} != {*false[1:]}), false], false
+    supports = [t for t in triples if t[0] in SUPPORTS]
+    if not supports:
+        return None
+    a, i, j = supports[int(rng.integers(len(supports)))]
+    return [*(t for t in triples if {*t[1:]} != {i, j}), (a, j, i)], (a, j, i)
+
+
 def _supports(encoded: EncodedScene) -> Bool[NDArray, "N N"]:
     """Return which instances are on-top of or inside which instances."""
     holds = encoded.instance_holds
@@ -136,6 +164,28 @@ def moved_by_pose(
             for j in rng.permutation(np.flatnonzero(pairs[i] & ~group)).tolist():
                 if (centre := place(boxes, i, j, rng)) is not None:
                     return _shifted(bare, group, centre - boxes.centre[i]), i
+    return None
+
+
+def lifted_or_sunk(
+    encoded: EncodedScene, structure: ClassMask, rng: Rng
+) -> tuple[Scene, int] | None:
+    """Return a scene with a box that floats or is sunk in, and the index of its object, or None."""
+    boxes = _Boxes.of(encoded, structure)
+    if rng.random() < 1 / 2:
+        candidates, step = boxes.usable, float(rng.uniform(*_FLOAT))
+    else:
+        depth = rng.uniform(*_SINK) * boxes.size[:, 2]
+        on_floor = boxes.bottom <= boxes.floor + CONTACT
+        candidates = boxes.usable & (depth >= _LEAST_SINK) & on_floor
+        step = math.nan
+    for i in rng.permutation(np.flatnonzero(candidates)).tolist():
+        group = boxes.group(i)
+        lift = -float(depth[i]) if math.isnan(step) else step
+        bottom = boxes.bottom[i] + lift
+        tops = boxes.top[boxes.usable & ~group]
+        if lift < 0 or (np.abs(tops - bottom) > _LEAST_SINK).all():
+            return _shifted(posed_scene(encoded), group, np.array([0.0, 0.0, lift])), i
     return None
 
 

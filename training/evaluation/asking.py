@@ -211,8 +211,8 @@ def _scenes(v: Float[Tensor, "B V"]) -> Iterator[Scene]:
 
 def score_misplaced(artifact: SceneModel, scene: Scene) -> list[dict[str, Any]]:
     """Return the misplaced relations of a scene; poses are read as in viewer axes."""
-    roles = None if artifact.places is None else artifact.places.roles
-    observed = observe(scene, typical_sizes=artifact.vocabulary.sizes, roles=roles)
+    sizes, spread, roles = artifact.vocabulary.sizes, artifact.spread, artifact.roles
+    observed = observe(scene, typical_sizes=sizes, spread=spread, roles=roles)
     return questions.misplaced(artifact, observed)
 
 

@@ -38,8 +38,9 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, one_hot
 
 from app.inference import Weights
-from app.model import Calibration, Counts, Offsets, Places, SceneModel
+from app.model import Calibration, Counts, Offsets, Places, Possibility, SceneModel
 from app.model.calibration import NO_LIMIT
+from app.model.possibility import UNKNOWN
 from app.model.statistics import ROOM
 from app.scene import CANONICAL, ObjectClass, Vocabulary
 from training.datasets.array_types import Table
@@ -224,6 +225,7 @@ def extended(
         offsets=artifact.offsets and _offsets(artifact.offsets, V, len(vocabulary)),
         counts=artifact.counts and _counts(artifact.counts, C, len(rooms), len(classes)),
         places=artifact.places and _places(artifact.places, V, len(vocabulary)),
+        possibility=artifact.possibility and _described(artifact.possibility, len(classes)),
     )
 
 
@@ -283,6 +285,17 @@ def _counts(counts: Counts, C: int, rooms: int, classes: int) -> Counts:
     return replace(counts, weights=np.concatenate([fixed, of_classes], axis=-1))
 
 
+def _described(prior: Possibility, classes: int) -> Possibility:
+    """Return the prior of possibility with further classes, which have no description."""
+    width = len(prior.stands[0])
+    return replace(
+        prior,
+        stands=np.pad(prior.stands, ((0, classes), (0, 0)), constant_values=1 / width),
+        traits=np.pad(prior.traits, ((0, classes), (0, 0)), constant_values=UNKNOWN),
+        spread=np.pad(prior.spread, (0, classes), constant_values=float(np.median(prior.spread))),
+    )
+
+
 def _places(places: Places, old: int, new: int) -> Places:
     """Return the places for `new` instead of `old` classes. New ones get the lowest frequency."""
 
@@ -298,4 +311,5 @@ def _places(places: Places, old: int, new: int) -> Places:
         frequency=frequency,
         role_anchor=averaged(places.role_anchor),
         stands=averaged(places.stands),
+        within=averaged(places.within),
     )

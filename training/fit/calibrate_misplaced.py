@@ -1,4 +1,4 @@
-"""Fit the judgement of observed relations, and of objects on the floor or on a wall.
+"""Fit the judgement of stated relations, and of the places of boxes.
 
 Each validation scene takes part several times: with true relations, with one of them altered, with
 its boxes, and with one moved object (`training.datasets.moved`). Sentences that a program has
@@ -21,14 +21,12 @@ from numpy.typing import NDArray
 from scipy.special import logit
 
 from app.model import AlarmLine, AlarmLines, Judgement, Misplaced, SceneModel
-from app.model.calibration import KINDS, LEAST_ALARM
+from app.model.calibration import KINDS, LEAST_ALARM, WEIGHTS
 from app.questions.misplaced import (
-    BELOW,
     BESIDE,
     EXPLAINED,
-    OVER,
-    STAND,
-    SUPPORT,
+    OVER_IT,
+    POSED,
     TERMS,
     Entries,
     entries_of,
@@ -47,7 +45,13 @@ from training.datasets.cases import (
     draw_true_relations,
     scene_rng,
 )
-from training.datasets.moved import moved_scene, untouched_scene
+from training.datasets.moved import (
+    has_boxes,
+    lifted_or_sunk,
+    moved_scene,
+    stacked_by_triple,
+    untouched_scene,
+)
 from training.evaluation.outlier_tasks import ALARMS
 from training.fit.regression import LEAST_SCENES, RIDGE, at_most, logistic
 
@@ -55,8 +59,11 @@ _SCENES: Final = 250  # maximum scenes of a source
 _SOURCE_SCENES: Final = 60  # minimum scenes of a source with its own alarm line
 _OF_WORDS: Final = 0.1  # weight of an altered on-top that is asked in the words "under"
 _LENGTHS: Final = (1, 2, 4, 8, 16, 32)  # numbers of entries to which the alarm lines are fitted
-# Share of the alarms that each kind of entry may raise. Wrong supports are the surest signs.
-_BUDGET: Final = {"lateral": 0.05, "support": 0.45, "above": 0.1, "under": 0.1, "stand": 0.3}
+# Share of the alarms that each kind of entry may raise, without boxes and with boxes.
+_BUDGET: Final = {
+    "lateral": 0.1, "support": 0.7, "above": 0.1, "under": 0.1,
+    "on_floor": 0.15, "on_object": 0.2, "unheld": 0.15,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +89,7 @@ def fit_misplaced(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: in
     if cases is None:
         return Misplaced()
     kinds = {
-        name: _fit_kind(cases.rows(cases.kind == kind), _BUDGET[name])
+        name: _fit_kind(cases.rows(cases.kind == kind), _BUDGET[name], posed=kind >= POSED)
         for kind, name in enumerate(KINDS)
     }
     return Misplaced().model_copy(update=kinds)
@@ -91,7 +98,7 @@ def fit_misplaced(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: in
 def _cases(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int) -> _Cases | None:
     """Ask about each scene several times, and return the usable entries; None without any scene.
 
-    An entry is a judged relation, or a judged stand (floor or wall) of an object.
+    An entry is a judged relation, or a judged box.
     """
     # Columns `encoded`, `source`, `untouched`, `complete` and `weight` of each question, and
     # columns `kind`, `terms` and `wrong` of its entries.
@@ -100,7 +107,7 @@ def _cases(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int) -> _
     for number, encoded in enumerate(scenes):
         # Without annotated supports, stands show nothing.
         shows_all = annotated_relations(encoded)[ON_TOP].any()
-        shown = range(len(KINDS)) if shows_all else (BESIDE, SUPPORT, OVER, BELOW)
+        shown = range(len(KINDS) if shows_all else POSED)
         for scene, wrong in _questions(artifact, encoded, seed):
             bare = replace(scene, room_type=None)
             entries = entries_of(artifact, Posterior(artifact, bare), bare)
@@ -109,9 +116,9 @@ def _cases(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int) -> _
             # Leave out listed relations above of scenes with boxes, and those with an explanation.
             listed_of_boxes = not bare.has_boxes and encoded.instance_positions is not None
             explained = listed_of_boxes | (entries.terms[:, 0] >= EXPLAINED)
-            usable &= (entries.kind != OVER) | ~explained
+            usable &= (entries.kind != OVER_IT) | ~explained
             weight = _OF_WORDS if wrong in bare.opposites else 1.0
-            of_scene.append((number, encoded.source, wrong is None, STAND in shown, weight))
+            of_scene.append((number, encoded.source, wrong is None, shows_all, weight))
             of_entries.append((entries.kind[usable], entries.terms[usable], is_wrong[usable]))
     if not of_scene:
         return None
@@ -145,14 +152,23 @@ def _questions(
         yield _stating(scene, scene.triples, unders), false
         if false[0] == ON_TOP:
             yield _stating(scene, scene.triples, [*unders, false]), false
+        literal = [triple for triple in triples if triple not in unders]
+        stacked = stacked_by_triple(encoded, structure, literal, scene_rng(encoded, seed + 4))
+        if stacked is not None:
+            yield _stating(scene, *stacked[:1], unders), stacked[1]
     untouched = untouched_scene(encoded, structure, scene_rng(encoded, seed + 1))
     moved = moved_scene(encoded, structure, scene_rng(encoded, seed + 1))
     if untouched is not None and moved is not None:
         sizes = artifact.vocabulary.sizes
-        roles = None if places is None else places.roles
+        spread, roles = artifact.spread, artifact.roles
         part = _part_of(untouched, scene_rng(encoded, seed + 2))
-        for shown, wrong in ((untouched, None), (part, None), moved):
-            yield observe(shown, typical_sizes=sizes, roles=roles), wrong
+        cases = [(untouched, None), (part, None), moved]
+        if has_boxes(encoded) and (
+            case := lifted_or_sunk(encoded, structure, scene_rng(encoded, seed + 3))
+        ):
+            cases.append(case)
+        for shown, wrong in cases:
+            yield observe(shown, typical_sizes=sizes, spread=spread, roles=roles), wrong
 
 
 def _stating(scene: Scene, triples: Sequence[Triple], unders: Collection[Triple]) -> Scene:
@@ -184,7 +200,7 @@ def _truth(
     return is_wrong, (entries.triple[:, 1:] != wrong).all(1) | is_wrong
 
 
-def _fit_kind(cases: _Cases, budget: float) -> Judgement | None:
+def _fit_kind(cases: _Cases, budget: float, *, posed: bool) -> Judgement | None:
     """Fit the judgement of one kind of entry; None with too few scenes or without any sense."""
     untouched = cases.rows(cases.untouched)
     if len(np.unique(untouched.encoded)) < LEAST_SCENES or not cases.wrong.any():
@@ -201,17 +217,22 @@ def _fit_kind(cases: _Cases, budget: float) -> Judgement | None:
         if (weights <= 0).all():
             break
         # A likelier relation, and a likelier stand, never make an entry more suspicious.
-        used = weights < 0
+        used[weights.argmax()] = False
     else:
         return None
-    terms = dict(zip(("relation", "change", "stand", "supporter"), weights.tolist(), strict=True))
+    terms = dict(zip(WEIGHTS, weights.tolist(), strict=True))
     silent = AlarmLines(**dict.fromkeys(ALARMS, AlarmLine(intercept=0.0)))
     judgement = Judgement(intercept=intercept, **terms, lines=silent)
-    return judgement.model_copy(update={"lines": _alarm_lines(judgement, untouched, budget)})
+    return judgement.model_copy(update={"lines": _alarm_lines(judgement, untouched, budget, posed)})
 
 
-def _alarm_lines(judgement: Judgement, untouched: _Cases, budget: float) -> AlarmLines:
-    """Fit the alarm lines to the highest log-odds among n random entries of untouched scenes."""
+def _alarm_lines(
+    judgement: Judgement, untouched: _Cases, budget: float, posed: bool
+) -> AlarmLines:
+    """Fit the alarm lines to the highest log-odds among n random entries of untouched scenes.
+
+    Lines of boxes do not depend on n: they are fitted to all entries of each scene.
+    """
     log_odds = wrong_log_odds(judgement, untouched.terms)
     rng = np.random.default_rng(0)
     points: dict[str, list[tuple[float, float]]] = {name: [] for name in ALARMS}
@@ -219,11 +240,11 @@ def _alarm_lines(judgement: Judgement, untouched: _Cases, budget: float) -> Alar
     starts = np.flatnonzero(np.diff(untouched.scene, prepend=-1))
     lists = np.split(log_odds, starts[1:])
     sources = untouched.source[starts]
-    for n in _LENGTHS:
+    for n in (1,) if posed else _LENGTHS:
         long_enough = [k for k, values in enumerate(lists) if len(values) >= n]
         if len(long_enough) < LEAST_SCENES:
             break
-        highest = np.array([rng.permutation(lists[k])[:n].max() for k in long_enough])
+        highest = np.array([rng.permutation(lists[k])[: None if posed else n].max() for k in long_enough])
         for name, share in ALARMS.items():
             limit = hardest_quantile(highest, sources[long_enough], 1 - budget * share)
             points[name].append((float(np.log(n)), limit))

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from app.model import Possibility
 from app.registry import Example
 from app.scene import RoleCounts, Vocabulary
 from training.datasets import (
@@ -37,6 +38,7 @@ from training.datasets.sources import is_inventory
 from training.datasets.vocabulary import plain_scenes, read_vocabulary, with_typical_sizes
 from training.datasets.written import written_vocabulary
 from training.fit.configuration import Config, ConfigError, DataConfig, is_file, source_name
+from training.fit.possibility import fit_possibility
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,7 @@ class SplitScenes:
     data: DataConfig
     vocabulary: Vocabulary  # the scenes use the indices of its classes
     roles: RoleCounts  # of the classes in the training scenes
+    possibility: Possibility | None  # of the classes; None: the training scenes show too little
     parts: dict[str, list[EncodedScene]]
     counts: dict[str, int]  # number of scenes, by source
     digests: dict[str, str]  # sha256 of the contents of the scenes, by source
@@ -80,6 +83,7 @@ class SplitScenes:
             words=self.words,
             vocabulary=self.vocabulary,
             roles=self.roles,
+            possibility=self.possibility,
         )
 
     def complete_data(self) -> TrainingData:
@@ -180,11 +184,13 @@ def split_and_encode(
     if vocabulary is None:
         vocabulary = build_vocabulary(data, parts["train"], root)
     roles = count_roles(parts["train"], vocabulary)
+    encoded = {name: encode(part, vocabulary, roles) for name, part in parts.items()}
     return SplitScenes(
         data=data,
         vocabulary=vocabulary,
         roles=roles,
-        parts={name: encode(part, vocabulary, roles) for name, part in parts.items()},
+        possibility=fit_possibility(parts["train"], encoded["train"], vocabulary),
+        parts=encoded,
         counts={name: len(source) for name, source in scenes.items()},
         digests={name: digest_of(source) for name, source in scenes.items()},
         words=torch.from_numpy(vocabulary.vectors[0]) if data.words else None,

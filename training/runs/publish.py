@@ -179,9 +179,9 @@ def with_statistics(model: SceneModel, scenes: SplitScenes) -> SceneModel:
 def publish_rounded(store: Store, description: Description, model: SceneModel) -> Artifact:
     """Publish weights and statistics in half precision."""
     state = dict(model.weights.arrays)
-    for statistics in (model.offsets, model.counts, model.places):
-        if statistics is not None:
-            state |= statistics.tensors()
+    for table in (model.offsets, model.counts, model.places, model.possibility):
+        if table is not None:
+            state |= table.tensors()
     return store.publish(description, state, storage_dtype="float16")
 
 

@@ -60,11 +60,21 @@ class Outlier(Reply):
     """for an outlier: absent classes that would make it likely, at most 3"""
 
 
+Reason = Literal["relation", "on-floor", "wrong-support", "floats", "sunk-in"]
+
+
 class MisplacedRelation(ScoredRelation):
-    """A relation in the form of the request, and the probability that the relation is false."""
+    """A relation in the form of the request, or the place of a box, and p that it is wrong.
+
+    For a box on the floor, above it or sunk into it, `object` is `floor`.
+    """
 
     is_misplaced: bool = False
     """true if `probability` reaches the threshold for `sensitivity`"""
+    reason: Reason = "relation"
+    """`relation`: the request states a wrong relation. Or a box is at a wrong place: `on-floor`,
+    though its class hardly stands there; `wrong-support`, on or in a wrong object; `floats`, held
+    by nothing; `sunk-in`, inside the floor or a solid object"""
     moved: str | None = None
     """id of the object that stands in the wrong place if the relation is misplaced"""
 

@@ -1,0 +1,150 @@
+"""What holds an object with a box: is the box explained by the usual places of its class?
+
+Let b be the bottom of the box of an object above the floor, with the error s. Each place has a
+likelihood of b, per metre:
+
+    floor       N(b; 0, s)
+    on or in j  overlap · [(1 - k) · N(b - top of j; 0, s) + k · U(b between bottom and top of j)]
+    on or in an object that the scene does not list   U, if b is between `LOWEST` and `HIGHEST`
+    on a wall or at the ceiling   half of that, and half of N(top; `HUNG`, `HUNG_STD`)
+    floating    U
+    sunk in     U, if the box reaches below the floor or into an object
+
+U is 1 / `ROOM` per metre. k is the share of things far below the top of such an object: on a seat,
+or on the boards of a shelf (`Places.within`). The usual places of the class have the shares
+S of floor, wall and support, and q of its supporters. An object above a usual supporter is hardly
+on an unlisted object. Objects at wrong places have the shares `WRONG`. The evidence of a wrong
+place is the log ratio
+
+    t = log Σ wrong share · likelihood - log Σ usual share · likelihood
+
+So an object is at a wrong place only if no usual place explains its box within the errors.
+"""
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+
+from app.compiling import compiled
+from app.scene.footprints import measure
+from app.scene.scene import MIN_OVERLAP, SMALLEST_STD, Boxes, normal_share
+
+Indices = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+ON_FLOOR, ON_OBJECT, FLOATS, SUNK = range(4)
+"""Reasons of a wrong place, which are indices of `WRONG`."""
+
+WRONG: Final = (0.25, 0.4, 0.25, 0.1)
+"""Shares of objects at wrong places: on the floor, on or in an object, floating, and sunk in."""
+
+ROOM: Final = 2.5  # height of a room in metres
+LOWEST: Final = 0.2  # lowest top in metres of an unlisted object on which others are
+HIGHEST: Final = 2.0  # highest top in metres of such an object
+HUNG: Final = 2.0  # usual height in metres of the top of an object on a wall
+HUNG_STD: Final = 0.6  # its standard deviation
+_BLOCKED: Final = 0.8  # share of unlisted supports that a usual supporter below rules out
+_USUAL: Final = 0.2  # share q from which a supporter counts fully as usual
+_LEAST_WITHIN: Final = 0.1  # minimum of k
+_CARRIES: Final = 0.5  # footprint of a supporter, as a share of that on it, that carries fully
+_UNUSUAL: Final = 0.02  # weight of an unusual supporter in the choice of the anchor
+_LEAST: Final = 1e-6  # minimum of a likelihood
+_SQRT_2_PI: Final = math.sqrt(2.0 * math.pi)
+
+
+class Standing(NamedTuple):
+    """The evidence that each of N objects is at a wrong place."""
+
+    log_ratio: Float[Floats, "N"]  # t; 0 without a box
+    reason: Int[Indices, "N"]  # the likeliest wrong place; -1 without a box
+    anchor: Int[Indices, "N"]  # the object at the likeliest wrong place, or -1
+
+
+@compiled
+def standing(
+    boxes: Boxes,
+    floor: float,  # height in metres, or NaN: unknown
+    shares: Float[NDArray, "N 3"],  # usual places of each object's class: floor, wall, support
+    supporters: Float[NDArray, "N N"],  # share q of object j's class among the supporters of i's
+    unlisted: Float[NDArray, " N"],  # share of the supporters that the scene does not list
+    within: Float[NDArray, " N"],  # share k of the things of each object far below its top
+) -> tuple[Float[NDArray, " N"], Int[NDArray, " N"], Int[NDArray, " N"]]:
+    """Return the fields of `Standing`."""
+    points, extents, turns, errors = boxes
+    N, uniform = len(points), 1.0 / ROOM
+    log_ratio, reason, anchor = np.zeros(N), np.full(N, -1), np.full(N, -1)
+    for i in range(N):
+        bottom = points[i, 2] - extents[i, 2] / 2
+        if math.isnan(bottom + extents[i, 0] + extents[i, 1]):
+            continue
+        s = max(errors[i, 1], SMALLEST_STD)
+        at_floor, below, unheld, hung, over = 0.0, 0.0, uniform, uniform, 0.0
+        if not math.isnan(floor):
+            at_floor, below = _normal(bottom - floor, s), normal_share(floor - 2 * s - bottom, s)
+            unheld *= normal_share(bottom - floor - LOWEST, s)
+            hung = unheld / 2 + _normal(bottom + extents[i, 2] - floor - HUNG, HUNG_STD) / 2
+            unheld *= normal_share(floor + HIGHEST - bottom, s)
+        usual = shares[i, 0] * at_floor + shares[i, 1] * hung
+        largest, total, sunk, deepest, near = 0.0, 0.0, below, -1, 0.0
+        for j in range(N):
+            if i == j or math.isnan(points[j, 2] + extents[j, 0] + extents[j, 1] + extents[j, 2]):
+                continue
+            overlap = _overlap(boxes, i, j)
+            if overlap < 0.05:
+                continue
+            top, k = points[j, 2] + extents[j, 2] / 2, max(within[j], _LEAST_WITHIN)
+            error = max(math.hypot(s, errors[j, 1]), SMALLEST_STD)
+            inside = normal_share(top - bottom, error) * normal_share(
+                bottom - top + extents[j, 2], error
+            )
+            carries = extents[j, 0] * extents[j, 1] / max(extents[i, 0] * extents[i, 1], 1e-9)
+            overlap *= min(carries / _CARRIES, 1.0)
+            height = max(extents[j, 2], error)
+            density = overlap * ((1 - k) * _normal(bottom - top, error) + k * inside / height)
+            usual += shares[i, 2] * supporters[i, j] * density
+            lifted = normal_share(bottom - top - LOWEST, error)
+            over = max(over, overlap * lifted * min(supporters[i, j] / _USUAL, 1.0))
+            total += density
+            near += overlap
+            likely = density * (supporters[i, j] + _UNUSUAL)
+            if likely > largest:
+                largest, anchor[i] = likely, j
+            deep = overlap * normal_share(top - 2 * error - bottom, error) * inside
+            if deep > sunk:
+                sunk, deepest = deep, j
+        usual += shares[i, 2] * unlisted[i] * (1.0 - _BLOCKED * over) * unheld
+        wrong = np.array([at_floor, total / max(near, 1.0), (1.0 - below) * uniform, sunk * uniform])
+        for place in range(4):
+            wrong[place] *= WRONG[place]
+        reason[i] = wrong.argmax()
+        if reason[i] == SUNK:
+            anchor[i] = deepest
+        elif reason[i] != ON_OBJECT:
+            anchor[i] = -1
+        log_ratio[i] = math.log(max(wrong.sum(), _LEAST) / max(usual, _LEAST))
+    return log_ratio, reason, anchor
+
+
+@compiled
+def _normal(distance, s):
+    """Return the density per metre of a normal distance with the standard deviation s."""
+    return math.exp(-0.5 * (distance / s) ** 2) / (s * _SQRT_2_PI)
+
+
+@compiled
+def _overlap(boxes, i, j):
+    """Return the probability that the footprints of two boxes overlap by `MIN_OVERLAP`."""
+    points, extents, turns, errors = boxes
+    radius = math.hypot(extents[i, 0], extents[i, 1]) + math.hypot(extents[j, 0], extents[j, 1])
+    distance = math.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1])
+    if distance > radius / 2:
+        return 0.0
+    share, _ = measure(points[i], extents[i], turns[i], points[j], extents[j], turns[j])
+    if share <= 0.0:
+        return 0.0
+    side = math.sqrt(min(extents[i, 0] * extents[i, 1], extents[j, 0] * extents[j, 1]))
+    error = math.hypot(errors[i, 0], errors[j, 0])
+    return normal_share((share - MIN_OVERLAP) * side, error)
