@@ -11,9 +11,9 @@ the tracks of its room. Printed are:
   known by its moved object and its reason. The onset is wrong if the moved object is not one of the
   intruders of the flat.
 - found moves. Before a patrol, one thing of the flat is moved to a wrong place of `MOVES`. It is
-  found if at least one frame has an alarm about it: an entry of `misplaced` whose `moved` is a track
-  of the thing, or an outlier that is a track of the thing. The last column counts patrols in which
-  the thing raises an alarm without the move.
+  found if at least one frame has an alarm about it: an entry of `misplaced` whose `moved` is a
+  track of the thing, or an outlier that is a track of the thing. The last column counts patrols in
+  which the thing raises an alarm without the move.
 """
 
 from __future__ import annotations
