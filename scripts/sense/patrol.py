@@ -12,8 +12,8 @@ the tracks of its room. Printed are:
   intruders of the flat.
 - found moves. Before a patrol, one thing of the flat is moved to a wrong place of `MOVES`. It is
   found if at least one frame has an alarm about it: an entry of `misplaced` whose `moved` is a
-  track of the thing, or an outlier that is a track of the thing. The last column counts patrols in
-  which the thing raises an alarm without the move.
+  track of the thing, or an outlier that is a track of the thing. The last column has the
+  frames with an alarm about it without the move.
 """
 
 from __future__ import annotations
@@ -158,6 +158,11 @@ def count_onsets(
     return right, +wrong
 
 
+def _alarms(frames: list[Frame], thing: str) -> int:
+    """Return the number of frames with an alarm about a thing."""
+    return sum(thing in frame.things for frame in frames)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -176,11 +181,10 @@ def main() -> None:
         found = 0
         for name, spots in MOVES.items():
             with flat.moved(spots) as thing:
-                after = [sum(thing in frame.things for frame in flat.drive(http, seed))
-                         for seed in options.seeds]  # fmt: skip
-            before = sum(any(thing in frame.things for frame in patrol) for patrol in patrols)
-            found += sum(frames > 0 for frames in after)
-            print(f"{name:26} frames with an alarm {after}, unmoved: {before} patrols")
+                moved = [list(flat.drive(http, seed)) for seed in options.seeds]
+            after, before = ([_alarms(frames, thing) for frames in p] for p in (moved, patrols))
+            found += sum(map(bool, after))
+            print(f"{name:26} frames with an alarm {after}, unmoved {before}")
         print(f"found {found} of {len(MOVES) * len(patrols)}")
 
 

@@ -28,9 +28,10 @@ it. The faults of a placement are, with lengths in metres:
 - ``anchor smaller``: for on-top, inside, contains and under, the footprint of the anchor is smaller
   than the typical footprint of the thing. Placements without an offset count, too.
 
-Placements of classes without a typical size, or at no given thing, are only counted. The last row has the same tests for
-the true places of the removed things of ProcTHOR: the faults that the definitions find there. Many
-of these things float, because ProcTHOR puts them 0.05 to 0.06 above their support.
+Placements of classes without a typical size, or at no given thing, are only counted. The last row
+has the same tests for the true places of the removed things of ProcTHOR: the faults that the
+definitions find there. Many of these things are in the air, because ProcTHOR puts them 0.05 to
+0.06 m above their support.
 """
 
 from __future__ import annotations
