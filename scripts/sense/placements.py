@@ -15,13 +15,13 @@ it. The faults of a placement are, with lengths in metres:
 
 - ``inside a solid``: its depth in a box is more than 0.05, or it is as deep below the floor, which
   is the lowest bottom of the room. Exceptions: the anchor for the relations inside, contains and
-  under; boxes that contain the anchor to the same depth, such as the shelf of a book; and, for
-  on-top, an anchor with seat and back (`BACKED`) whose lower 40 % the thing does not reach.
+  under; boxes that contain the centre of the anchor, such as the shelf of a book; and, for on-top,
+  an anchor with seat and back (`BACKED`) whose lower 40 % the thing does not reach.
 - ``in the air``: on-top: its bottom is more than 0.05 above the top of the anchor, or its centre is
   beside the footprint of the anchor. Left, right, front, behind and under: neither the floor nor a
   top below its centre is within 0.05 below its bottom. Not tested are classes that hang on walls
   and ceilings in at least half of all cases, or that have no row in ``things.csv``, and things
-  inside a box that contains the anchor.
+  inside a box that contains the centre of the anchor.
 - ``on an occupied spot``: its footprint overlaps that of another thing by more than 0.02 along both
   axes, and both bottoms differ by at most 0.05. A flat thing below it, such as a rug, is no fault.
   Not tested are classes that hang, and the relations above and below.
@@ -122,8 +122,9 @@ class Placement:
 
     @property
     def _around(self) -> list[Box]:
-        """Other boxes that contain the anchor."""
-        return [box for box in self.others if self.anchor.depth(box) > TOUCH]
+        """Other boxes that contain the centre of the anchor."""
+        centre = self.anchor.centre
+        return [b for b in self.others if ((b.low <= centre) & (centre <= b.high)).all()]
 
     @property
     def solid(self) -> str:
