@@ -5,13 +5,13 @@
 The rooms are of ProcTHOR and VirtualHome. They are kept out of the training part of both splits
 with seed 0: `final`, of the shipped weights, and `group`, of the measured weights. Of each room,
 one or two small things (at most 0.5 m long) are removed that are the only ones of their label and
-carry nothing. `/missing` gets the labels, positions, sizes and yaws of all other things, in the
-frame map with a viewpoint at the middle of the side with the lowest x, and answers with `top_k` 10.
+carry nothing. `/missing` gets the labels, positions, sizes and yaws of all other things, and answers
+with `top_k` 10. The frame is a map. The viewpoint is the middle of the side with the lowest x.
 
-A box of the typical size of the proposed class (`size` of the vocabulary) stands at the position of
-the anchor plus the mean offset, with its longer side along the longer side of the anchor. All boxes
-are parallel to the axes. The depth of a box in another is the shortest way along an axis that frees
-it. The faults of a placement are, with lengths in metres:
+A box of the typical size of the proposed class (`size` of the vocabulary) is put at the position of
+the anchor plus the mean offset. Its longer side is parallel to the longer side of the anchor. All
+boxes are parallel to the axes. The depth of a box in another is the shortest way along an axis that
+frees it. The faults of a placement are, with lengths in metres:
 
 - ``inside a solid``: its depth in a box is more than 0.05, or it is as deep below the floor, which
   is the lowest bottom of the room. Exceptions: the anchor for the relations inside, contains and
@@ -19,12 +19,12 @@ it. The faults of a placement are, with lengths in metres:
   an anchor with seat and back (`BACKED`) whose lower 40 % the thing does not reach.
 - ``in the air``: on-top: its bottom is more than 0.05 above the top of the anchor, or its centre is
   beside the footprint of the anchor. Left, right, front, behind and under: neither the floor nor a
-  top below its centre is within 0.05 below its bottom. Not tested are classes that hang on walls
-  and ceilings in at least half of all cases, or that have no row in ``things.csv``, and things
-  inside a box that contains the centre of the anchor.
+  top below its centre is within 0.05 below its bottom. Three sorts are left out: classes that hang
+  on walls and ceilings in at least half of all cases, classes without a row in ``things.csv``, and
+  things inside a box that contains the centre of the anchor.
 - ``on an occupied spot``: its footprint overlaps that of another thing by more than 0.02 along both
-  axes, and both bottoms differ by at most 0.05. A flat thing below it, such as a rug, is no fault.
-  Not tested are classes that hang, and the relations above and below.
+  axes, and both bottoms differ by at most 0.05. A flat thing below it, such as a rug, is allowed.
+  Classes that hang, and the relations above and below, are left out.
 - ``anchor smaller``: for on-top, inside, contains and under, the footprint of the anchor is smaller
   than the typical footprint of the thing. Placements without an offset count, too.
 
