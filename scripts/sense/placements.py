@@ -6,7 +6,7 @@ The rooms are of ProcTHOR and VirtualHome. They are kept out of the training par
 with seed 0: `final`, of the shipped weights, and `group`, of the measured weights. Of each room,
 one or two small things (at most 0.5 m long) are removed that are the only ones of their label and
 carry nothing. `/missing` gets the labels, positions, sizes and yaws of all other things, and
-answers with `top_k` 10. The frame is a map. The viewpoint is the middle of the side with the lowest x.
+answers with `top_k` 10. The frame is a map, seen from the middle of the side with the lowest x.
 
 A box of the typical size of the proposed class (`size` of the vocabulary) is put at the position of
 the anchor plus the mean offset. Its longer side is parallel to the longer side of the anchor. All
