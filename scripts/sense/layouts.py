@@ -141,7 +141,7 @@ def print_layouts(
 ) -> None:
     """Print how many boxes overlap, how many hanging things stand, and the broken relations."""
     pairs, standing = Counter[tuple[str, str]](), Counter[str]()
-    overlapping, objects = 0, 0
+    overlapping, objects, hanging = 0, 0, 0
     stated, broken = Counter[str](), Counter[str]()
     for scene, boxes in zip(scenes, layouts, strict=True):
         triples = triples_of(scene["relations"])
@@ -149,13 +149,15 @@ def print_layouts(
         pairs.update(found)
         overlapping += bool(found)
         objects += len(boxes)
-        standing.update(standing_though_hanging(boxes, triples, things))
+        alone = hanging_alone(boxes, triples, things)
+        hanging += len(alone)
+        standing.update(box["id"] for box in alone if is_supported(box, boxes))
         stated.update(relation for _, relation, _ in triples)
         broken.update(relation for _, relation, _ in triples - observed(client, boxes))
     print(f"{len(scenes)} layouts of {objects} objects")
     print(f"layouts with overlapping boxes: {overlapping}")
     print(f"overlapping pairs: {pairs.total() / len(scenes):.2f} a layout; {listed(pairs)}")
-    print(f"hanging things that stand: {standing.total()}; {listed(standing)}")
+    print(f"hanging things that stand: {standing.total()} of {hanging}; {listed(standing)}")
     print(f"broken relations: {broken.total()} of {stated.total()}, {share(broken, stated)}")
 
 
@@ -213,13 +215,10 @@ def overlaps(boxes: list[Box], triples: set[Triple]) -> Iterator[tuple[str, str]
             yield names
 
 
-def standing_though_hanging(boxes: list[Box], triples: set[Triple], things: Things) -> list[str]:
+def hanging_alone(boxes: list[Box], triples: set[Triple], things: Things) -> list[Box]:
+    """Return the boxes of hanging things that are on or in no other thing."""
     held = {subject for subject, relation, _ in triples if relation in HOLDS}
-    return [
-        box["id"]
-        for box in boxes
-        if things.hangs(box["id"]) and box["id"] not in held and is_supported(box, boxes)
-    ]
+    return [box for box in boxes if things.hangs(box["id"]) and box["id"] not in held]
 
 
 def is_supported(box: Box, boxes: list[Box]) -> bool:

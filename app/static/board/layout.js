@@ -8,9 +8,9 @@
 import { fitsInto, halves, overlap, radians, round } from './geometry.js';
 
 const ROBOT = { id: '\u0000robot', x: 0, y: 0, z: 0, yaw: 0, size: { x: 0.4, y: 0.4, z: 1 } }; // not a valid object id
-const MIDDLE = 2.4; // metres from the robot to the middle of the layout
+const MIDDLE = 3; // metres from the robot to the middle of the layout
 const AROUND = 0.5; // metres that stay free in front of the robot
-const GAPS = [0.1, 0.02]; // metres between boxes, preferred first
+const GAPS = [0.1, 0.02, 0]; // metres between boxes, preferred first
 const TOUCH = 1e-6; // metres
 const OVER = 0.1; // metres between a box and a box above it
 const EYES = 1.5; // height in metres of the centre of hanging things
@@ -122,7 +122,7 @@ function nextOf(boxes, placed) {
 function bestSpot(box, triples, placed, side) {
   const boxes = [...placed.values()];
   const of = (relation) => box.holders.filter(([name, id]) => name === relation && placed.has(id)).map(([, id]) => placed.get(id));
-  const supports = of('on-top').map((support) => coverOf(support, boxes));
+  const supports = of('on-top').map((support) => carrier(support, box, boxes));
   const known = triples.map(([subject, name, object]) => [name, placed.get(subject), placed.get(object)]).filter(([, a, b]) => a || b);
   // A box that does not fit on its support, or that lies under furniture, stands near it.
   const [, a, b] = known.find(([name]) => CAN_HOLD[name]) ?? [];
@@ -153,10 +153,11 @@ const holding = (relations, box) => relations.reduce((count, [name, a, b]) => co
 
 const isBetter = (a, b) => (b.holding - a.holding || a.far - b.far) < 0;
 
-/** The box that carries the loads of a support: its cover, or itself. */
-function coverOf(support, boxes) {
-  const found = boxes.find((box) => box.on?.id === support.id && box.size.z <= FLAT && area(box) >= COVER * area(support));
-  return found ? coverOf(found, boxes) : support;
+/** The box that carries a load on a support: a larger cover, or the support itself. */
+function carrier(support, load, boxes) {
+  const isCover = (box) => box.on?.id === support.id && box.size.z <= FLAT && area(box) >= COVER * area(support);
+  const found = boxes.find((box) => isCover(box) && area(box) > area(load));
+  return found ? carrier(found, load, boxes) : support;
 }
 
 const onTop = (box, support, overhang) =>
@@ -165,7 +166,8 @@ const onTop = (box, support, overhang) =>
 /** Spots in a container: on its bottom, or on other contents. */
 function inside(box, container, boxes) {
   const contents = boxes.filter(({ within }) => within?.includes(container.id));
-  const bottom = (x, y) => Math.max(container.z, ...contents.filter((other) => overlap({ ...box, x, y }, other)).map(top));
+  const own = wider(box, 0);
+  const bottom = (x, y) => Math.max(container.z, ...contents.filter((other) => overlap({ ...own, x, y }, other)).map(top));
   return over(box, container, false, [container.id, ...(container.within ?? [])], bottom)
     .filter(({ z }) => z === container.z || z + box.size.z <= top(container));
 }
@@ -202,9 +204,12 @@ function onWall(box, boxes, near) {
   ].map(([x, y]) => spotAt(near, x, y, hanging(box))));
 }
 
+/** A box with a gap around it. It does not overlap boxes that only touch it. */
+const wider = ({ size: { x, y, z }, ...box }, gap) => ({ ...box, size: { x: x + 2 * (gap - TOUCH), y: y + 2 * (gap - TOUCH), z } });
+
 /** A function that says whether a box at a spot, with a gap around it, reaches into no other box but its containers. */
 function freedom(box, boxes, gap) {
-  const wide = { ...box, size: { x: box.size.x + 2 * gap, y: box.size.y + 2 * gap, z: box.size.z } };
+  const wide = wider(box, gap);
   const half = halves(wide);
   const reaches = ({ x, y, z, within }, other) =>
     other.z < z + box.size.z - TOUCH && top(other) > z + TOUCH &&
