@@ -9,9 +9,9 @@ the page's own `layout.js` on each scene. The script counts:
 - hanging things that stand: things that hang on a wall or from the ceiling by the table of things,
   and whose box stands on the floor or on another box, although no relation says so.
 - broken relations: relations of the scene that the service does not observe in the boxes.
-- impossible pairs, a fault of the model and not of the page: relations *on-top* and *inside* whose
-  subject has a footprint of more than `LARGER` times that of the object, and those whose object is
-  no surface or no container by the table of things.
+- impossible pairs: relations *on-top* and *inside* of the scene, whatever its boxes. The footprint
+  of the subject is more than `LARGER` times that of the object, or the table of things says that
+  nothing is put on or into the object.
 
 The script needs Debian's chromium and the development dependencies.
 """

@@ -8,8 +8,8 @@
 import { fitsInto, halves, overlap, radians, round } from './geometry.js';
 
 const ROBOT = { id: '\u0000robot', x: 0, y: 0, z: 0, yaw: 0, size: { x: 0.4, y: 0.4, z: 1 } }; // not a valid object id
-const MIDDLE = 3; // metres from the robot to the middle of the layout
-const AROUND = 0.5; // metres that stay free in front of the robot
+const MIDDLE = 4; // metres from the robot to the first box
+const AROUND = 0.8; // metres that stay free in front of the robot
 const GAPS = [0.1, 0.02, 0]; // metres between boxes, preferred first
 const TOUCH = 1e-6; // metres
 const OVER = 0.1; // metres between a box and a box above it
@@ -33,7 +33,7 @@ const CANONICAL = {
 /** Numbers from -1 to 1, at equal distances. */
 const evenly = (count) => Array.from({ length: count }, (_, index) => (2 * index) / (count - 1) - 1);
 const ON_FACE = evenly(25);
-const ON_FLOOR = evenly(41);
+const ON_FLOOR = evenly(61);
 
 const top = (box) => box.z + box.size.z;
 const area = (box) => box.size.x * box.size.y;
@@ -55,8 +55,11 @@ export function layOut(fixed, free, relations, viewer, hanging) {
     return { id, size, x: x * c + y * s, y: y * c - x * s, z, yaw, half: halves({ size, yaw }), hangs: hanging.has(box.label) };
   };
   const places = place(fixed.map(seen), free.map(seen), canonical(relations));
+  // Without fixed boxes, the layout begins in front of the robot.
+  const shift = fixed.length ? 0 : Math.max(0, Math.min(...[...places.values()].map(({ x, half }) => x - half.x)) - AROUND);
   return free.map((box) => {
-    const { x, y, z } = places.get(box.id);
+    const { x: ahead, y, z } = places.get(box.id);
+    const x = ahead - shift;
     return { ...box, x: round(viewer.x + x * c - y * s), y: round(viewer.y + x * s + y * c), z: round(z) };
   });
 }
@@ -81,9 +84,9 @@ function place(fixed, free, triples) {
   const holders = (box) => related.get(box.id).filter(([id, name, other]) => id === box.id && CAN_HOLD[name]?.(boxes.get(other), box));
   const waiting = new Map(free.map((box) => [box.id, { ...box, holders: holders(box).map(([, name, id]) => [name, id]) }]));
   const placed = new Map(fixed.map((box) => [box.id, box]));
-  const side = 2 + 1.5 * Math.sqrt([...boxes.values()].reduce((sum, box) => sum + area(box), 0)); // of the floor, in metres
+  const side = 3 + 2 * Math.sqrt([...boxes.values()].reduce((sum, box) => sum + area(box), 0)); // of the floor, in metres
   while (waiting.size) {
-    const box = nextOf([...waiting.values()], placed);
+    const box = nextOf([...waiting.values()], related, placed);
     waiting.delete(box.id);
     placed.set(box.id, bestSpot(box, related.get(box.id), placed, side));
   }
@@ -97,13 +100,18 @@ const CAN_HOLD = {
   inside: (container, box) => fitsInto(box, container),
 };
 
-/** The next box: one whose holders have places, if possible. Standing boxes come first, hanging ones last, large before small ones. */
-function nextOf(boxes, placed) {
+/**
+ * The next box: one whose holders have places, if possible. Standing boxes come first, those with most relations to placed
+ * boxes, and hanging ones last. Large boxes come before small ones, such as a mattress before a pillow.
+ */
+function nextOf(boxes, related, placed) {
   const ranked = boxes.map((box) => {
+    const isHeld = box.holders.length > 0;
     const pending = box.holders.filter(([, id]) => !placed.has(id)).length;
-    return { box, pending, stage: box.holders.length ? 1 : 2 * Number(box.hangs) };
+    const links = isHeld ? 0 : related.get(box.id).filter(([a, , b]) => placed.has(a) || placed.has(b)).length;
+    return { box, pending, links, stage: isHeld ? 1 : 2 * Number(box.hangs) };
   });
-  const order = (a, b) => a.pending - b.pending || a.stage - b.stage || area(b.box) - area(a.box);
+  const order = (a, b) => a.pending - b.pending || a.stage - b.stage || b.links - a.links || area(b.box) - area(a.box);
   return ranked.reduce((best, one) => (order(one, best) < 0 ? one : best)).box;
 }
 
