@@ -26,8 +26,9 @@ _CAUSE: Final = {
     "reason": "checksum_mismatch",
     "detail": "model.safetensors does not match the manifest",
 }
+_PLAIN: Final = {"aliases": [], "structure": False, "anywhere": False, "hangs": False}
 _BIN: Final = {
-    "label": "garbage bin", "aliases": ["trash can"], "structure": False, "anywhere": False,
+    **_PLAIN, "label": "garbage bin", "aliases": ["trash can"],
     "size": {"x": 0.3, "y": 0.3, "z": 0.5}, "parent": "container",
 }  # fmt: skip
 _REFUSED: Final = {"version": "1.1.0", "status": "refused", "aliases": [], **_CAUSE}
@@ -100,8 +101,8 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
         "model": _MODEL,
         "objects": [
             _BIN,
-            {"label": "container", "aliases": [], "structure": False, "anywhere": False},
-            {"label": "floor", "aliases": [], "structure": True, "anywhere": False},
+            {**_PLAIN, "label": "container"},
+            {**_PLAIN, "label": "floor", "structure": True},
         ],
         "relations": [
             *("left", "front", "on-top", "above", "inside"),

@@ -12,10 +12,10 @@ from starlette.responses import Response
 
 from app.api.openapi import error_responses
 from app.errors import InvalidRequestError
+from app.model.scene_model import SceneModel
 from app.registry import Artifact
 from app.registry.manifest import of_machine
 from app.scene.spatial_relations import relation_names
-from app.scene.vocabulary import ObjectClass
 from app.serving.models import ServedModels
 from app.serving.runtime import Runtime
 from scene_client import schemas
@@ -127,7 +127,7 @@ async def show_word(
         if reading is None:
             matches = vocabulary.nearest(word)
             return answer(suggestions=[vocabulary.labels[match.entry] for match in matches])
-        entry = _class(vocabulary.objects[reading.entry])
+        entry = _class(served.model, reading.entry)
         return answer(class_=entry, rule=reading.rule, certain=reading.is_certain)
 
     # A guess compares the label with all names, which takes milliseconds.
@@ -140,7 +140,7 @@ def _vocabulary(served: Artifact) -> schemas.VocabularyAnswer:
     relations, rooms = relation_names(model.spec.A), vocabulary.room_types
     return schemas.VocabularyAnswer(
         model=served.reference,
-        objects=[_class(entry) for entry in vocabulary.objects],
+        objects=[_class(model, index) for index in range(len(vocabulary.objects))],
         relations=[cast("schemas.RelationName", name) for name in relations],
         room_types=list(rooms),
         rare_room_types=[rooms[t] for t in calibration.rare_rooms],
@@ -153,9 +153,11 @@ def _vocabulary(served: Artifact) -> schemas.VocabularyAnswer:
     )
 
 
-def _class(entry: ObjectClass) -> schemas.VocabularyEntry:
+def _class(model: SceneModel, index: int) -> schemas.VocabularyEntry:
+    entry = model.vocabulary.objects[index]
     size = entry.size and dict(zip("xyz", entry.size, strict=True))
-    return schemas.VocabularyEntry(**asdict(entry) | {"size": size})
+    hangs = model.places is not None and bool(model.places.hanging[index])
+    return schemas.VocabularyEntry(**asdict(entry) | {"size": size, "hangs": hangs})
 
 
 def _name(models: ServedModels, reference: str) -> str:

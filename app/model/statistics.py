@@ -339,6 +339,11 @@ class Places(TensorGroup):
         """The roles of pairs of classes."""
         return RoleCounts(self.role_pair.astype(np.int64), self.role_counts, self.role_anchor)
 
+    @cached_property
+    def hanging(self) -> Bool[NDArray[np.bool_], "V"]:
+        """Whether most objects of each class hang on a wall or from the ceiling."""
+        return self.stands[:, HANGS] > USUAL
+
     def log_ratio(self, relation: int, anchor: int, *, outgoing: bool) -> Float[Floats, "V"]:
         """Return log p(i at a, j) - log p(i) of each class i, with relation a and anchor class j.
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+import numpy as np
 import pytest
 from httpx import ASGITransport, AsyncClient
 
@@ -20,6 +21,7 @@ from app.scene.spatial_relations import CANONICAL, opposite
 from app.settings import Settings
 from tests.http.stores import PROFILES, VOCABULARY, corrupt, publish
 from tests.http.test_problems import problem
+from tests.questions.artifacts import places_of
 from tests.services import NAMED, PATIENCE, Pause, Replace, defect, load_changes, serve
 
 
@@ -60,6 +62,19 @@ async def test_the_vocabulary_lists_every_class(client: AsyncClient) -> None:
     (example,) = words["examples"]
     assert example["name"] == "A bedroom"
     assert (await client.post("/missing", json=example["scene"])).status_code == 200
+
+
+async def test_the_vocabulary_names_the_classes_that_hang(own, store):
+    stands = np.full((len(VOCABULARY), 3), np.float32([0.4, 0.5, 0.1]))
+    stands[VOCABULARY.labels.index("lamp")] = [0.3, 0.6, 0.1]
+    places = places_of(len(VOCABULARY), {(2, 2, 1): 3}, stands=stands)
+    publish(store, "home", "2.0.0", alias="default", groups=[places])
+    await load_changes(own)
+    words = (await own.get("/models/default/vocabulary")).json()
+    assert [entry["label"] for entry in words["objects"] if entry["hangs"]] == ["lamp"]
+    for word, hangs in (("lamps", True), ("bed", False)):
+        answer = (await own.get(f"/models/default/vocabulary/{word}")).json()
+        assert answer["class"]["hangs"] is hangs
 
 
 @pytest.mark.parametrize(

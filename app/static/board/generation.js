@@ -4,7 +4,7 @@ import { call, ProblemError, UnreachableError } from './api.js';
 import { calls, problemWords } from './columns.js';
 import { el } from './dom.js';
 import { layOut } from './layout.js';
-import { sceneFor, sizesOf, UNKNOWN_LABELS } from './questions.js';
+import { hangingOf, sceneFor, sizesOf, UNKNOWN_LABELS } from './questions.js';
 import { newLine } from './records.js';
 import { freshId, FULL, MOST_OBJECTS, sizer } from './scene.js';
 import { changed } from './store.js';
@@ -84,7 +84,7 @@ export function createGeneration(form, drawn, store, say) {
     const relations = scene.relations.map((one) => ({
       relation: one.relation, subject: ids.get(one.subject), object: ids.get(one.object),
     }));
-    const placed = layOut(board.map(sized), added.map(sized), relations, state.viewer);
+    const placed = layOut(board.map(sized), added.map(sized), relations, state.viewer, hangingOf(state, state.models[0]));
     return {
       things: [...board, ...placed.map((box) => ({ ...box, size: null }))],
       fresh: new Set(added.map(({ id }) => id)), relations,

@@ -50,6 +50,17 @@ export function inside(box, other) {
   return x + half.x <= other.size.x / 2 && y + half.y <= other.size.y / 2;
 }
 
+/** Whether the extents of a footprint are at most this share of those of another one. */
+export function fits(box, other, share) {
+  const half = halves({ size: box.size, yaw: box.yaw - other.yaw });
+  return half.x <= share * (other.size.x / 2) && half.y <= share * (other.size.y / 2);
+}
+
+const HIGHEST = 1.2; // height of contents, as a share of that of their container, by the service's rule
+
+/** Whether a box fits into a container. */
+export const fitsInto = (box, container) => fits(box, container, 1) && box.size.z <= HIGHEST * container.size.z;
+
 /** Distance between two separate footprints in metres: that of a corner to the other footprint. */
 export function gap(a, b) {
   const distances = [[a, b], [b, a]].flatMap(([box, other]) => [[1, 1], [1, -1], [-1, 1], [-1, -1]].map(([p, q]) => {

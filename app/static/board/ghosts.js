@@ -1,7 +1,7 @@
 /** Places on the board for missing objects ("ghosts"). */
 
 import { judgedBy } from './edges.js';
-import { gap, halves, inside, overlap, round, UNKNOWN_SIZE } from './geometry.js';
+import { fits, fitsInto, gap, halves, inside, overlap, round, UNKNOWN_SIZE } from './geometry.js';
 import { LIKELY, sizesOf } from './questions.js';
 import { freshId, FULL, MOST_OBJECTS, sizer } from './scene.js';
 
@@ -15,7 +15,6 @@ const CLEAR = 0.1;
 const NEIGHBOURS = 0.9;
 const THIN = 0.03;
 const OVERHANG = 1.25; // share of the support's extent that a footprint on it may have
-const HIGHEST = 1.2; // share of the container's height that contents may have, by the service's rule
 /** The part of half a suggestion that stays over the anchor at its learnt offset. */
 const HELD = 0.6;
 const GAP = 0.15; // metres between neighbours without a learnt offset
@@ -139,22 +138,15 @@ function freeAt(anchor, { relation, offset }, size, viewer, boxes, ghosts) {
 /** Whether the sizes of the anchor and of a suggestion allow the relation. */
 function hasRoom(anchor, relation, own) {
   const beneath = anchor.z + THIN >= own.size.z; // free height below the anchor
-  const holds = (box, other) => fits(box, other, 1) && box.size.z <= HIGHEST * other.size.z;
   const rooms = {
     'on-top': () => fits(own, anchor, OVERHANG),
-    inside: () => holds(own, anchor),
-    contains: () => holds(anchor, own),
+    inside: () => fitsInto(own, anchor),
+    contains: () => fitsInto(anchor, own),
     // A lower object stands between the legs of the anchor.
     under: () => beneath || (fits(own, anchor, 1) && own.size.z < anchor.size.z),
     below: () => beneath,
   };
   return rooms[relation]?.() ?? true;
-}
-
-/** Whether the extents of a footprint are at most this share of those of another one. */
-function fits(box, other, share) {
-  const half = halves({ size: box.size, yaw: box.yaw - other.yaw });
-  return half.x <= share * (other.size.x / 2) && half.y <= share * (other.size.y / 2);
 }
 
 const wider = (box, by) => ({ ...box, size: { ...box.size, x: box.size.x + 2 * by, y: box.size.y + 2 * by } });

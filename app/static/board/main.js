@@ -14,7 +14,7 @@ import { layOut } from './layout.js';
 import { createList } from './list.js';
 import { createModels } from './models.js';
 import { createProperties } from './properties.js';
-import { sizesOf } from './questions.js';
+import { hangingOf, sizesOf } from './questions.js';
 import { watchService } from './recovery.js';
 import { fromScene, SceneError, sizer } from './scene.js';
 import { createRecords, newLine, withSources } from './records.js';
@@ -47,8 +47,9 @@ function put(scene, change = {}, line = newLine()) {
   const sizes = sizesOf(store.get(), store.get().models[0]);
   const { things, viewer, room, relations, optical } = fromScene(scene, sizes);
   const boxes = things.map(sizer(sizes));
-  const loose = boxes.filter(({ placed }) => !placed).map((box) => ({ ...box, x: undefined, y: undefined }));
-  const places = new Map(layOut(boxes.filter(({ placed }) => placed), loose, relations, viewer).map((box) => [box.id, box]));
+  const [fixed, free] = [boxes.filter(({ placed }) => placed), boxes.filter(({ placed }) => !placed)];
+  const hanging = hangingOf(store.get(), store.get().models[0]);
+  const places = new Map(layOut(fixed, free, relations, viewer, hanging).map((box) => [box.id, box]));
   store.edit({
     things: withSources(things.map((thing) => {
       const { x, y, z } = places.get(thing.id) ?? thing;

@@ -26,6 +26,7 @@ function words({ objects, room_types: rooms, examples = [] }) {
     objects, rooms, examples,
     proposed: objects.filter(({ structure }) => !structure).map(({ label }) => label),
     // A Map, because a label such as “constructor” would clash with a property of plain objects.
+    hanging: new Set(objects.filter(({ hangs }) => hangs).flatMap(({ label, aliases }) => [label, ...aliases])),
     sizes: new Map(objects.filter(({ size }) => size).flatMap(
       ({ label, aliases, size }) => [label, ...aliases].map((name) => [name, size]))),
   };

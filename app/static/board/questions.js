@@ -21,6 +21,9 @@ export const LIKELY = 0.25;
 /** Typical sizes of a model's classes, by label. */
 export const sizesOf = (state, model) => state.words[model]?.sizes ?? new Map();
 
+/** Labels of a model's classes that hang on a wall or from the ceiling. */
+export const hangingOf = (state, model) => state.words[model]?.hanging ?? new Set();
+
 /** How a model reads a label of no class: as a similar class, then by its meaning, else it leaves the object out. */
 export const UNKNOWN_LABELS = 'by-meaning';
 

@@ -97,6 +97,8 @@ class VocabularyEntry(Reply):
     """label of the broader class, such as lamp for floor lamp"""
     anywhere: bool = False
     """true if objects of the class belong in every room: pets, people, bags, toys"""
+    hangs: bool = False
+    """true if most objects of the class hang on a wall or from the ceiling"""
 
 
 class ExampleScene(Reply):
