@@ -121,6 +121,7 @@ def _read(
         limits,
         look_ups,
         roles=None if model.places is None else model.places.roles,
+        stands=None if model.places is None else model.places.stands,
         profiles=artifact.manifest.vocabulary.profiles,
         may_be_empty=question.samples,
     )

@@ -54,7 +54,7 @@ function poseOf({ x, y, z, yaw, size }) {
 
 /** Limits of the service: coordinate and extent in metres, heading in radians, number of objects. */
 const FARTHEST = 1e8;
-const LARGEST = 1e4;
+const LARGEST = 1e7;
 const MOST_TURNED = 1e3;
 export const MOST_OBJECTS = 256;
 export const FULL = `A scene can have at most ${MOST_OBJECTS} objects. Remove one first.`;

@@ -43,7 +43,7 @@ MAX_RELATIONS: Final = 4096
 """Default limits of the service for one scene."""
 
 _MAX_LABEL, _MAX_ID, _MAX_FRAME = 100, 128, 256
-_MAX_METRES, _MAX_EXTENT, _MAX_YAW = 1e8, 1e4, 1e3
+_MAX_METRES, _MAX_EXTENT, _MAX_YAW = 1e8, 1e7, 1e3
 # A quaternion shorter than this length counts as unset.
 _MIN_NORM: Final = 1e-6
 

@@ -1,0 +1,1 @@
+"""Measurements of the physical sense of a running service."""
