@@ -122,7 +122,7 @@ def evidence_of(
         spread=np.full(len(rows), SPREAD),
         stands=usual,
     )
-    log_p, factor = log_likelihoods(boxes, _readings(declared))
+    log_p, factor = log_likelihoods(boxes, readings_of(declared))
     if any(q) and any_tilted(boxes.turn, _UPS.index(declared.up)):
         other = declared._replace(quaternion_order=_OTHER_ORDER[declared.quaternion_order])
         again = reread(other)
@@ -132,13 +132,25 @@ def evidence_of(
             yaw=np.array([again[row].yaw for row in rows]),
             turn=_in_order(q, other),
         )
-        of_order, _ = log_likelihoods(reordered, _readings(declared))
+        of_order, _ = log_likelihoods(reordered, readings_of(declared))
         log_p, found = np.append(log_p, of_order[0]), (*found, _of_order(other))
     return Evidence(found, log_p - log_p[0], factor)
 
 
+def warm_up(vocabulary: Vocabulary, stands: Float[NDArray[np.floating], "V 3"] | None) -> None:
+    """Compare the readings of three boxes, so that numba compiles or loads every loop."""
+    sized = (k for k, entry in enumerate(vocabulary.objects) if entry.size and not entry.structure)
+    if (index := next(sized, None)) is not None:
+        size = vocabulary.objects[index].size
+        objects = [SceneObject("", "", index, position=(0.0, 0.0, 0.0), size=size)] * LEAST
+        overturned = {0: (1.0, 0.0, 0.0, 0.0)}
+        evidence_of(objects, overturned, Conventions(), vocabulary, stands, lambda _: objects)
+
+
 def _in_order(q: Sequence[Quaternion | None], conventions: Conventions) -> NDArray[np.float64]:
     """Return quaternions in the order x, y, z, w, and NaN for objects without one."""
+    if not any(q):
+        return np.full((len(q), 4), math.nan)
     turn = np.array([(math.nan,) * 4 if one is None else one for one in q])
     return turn if conventions.quaternion_order == "xyzw" else np.roll(turn, -1, axis=1)
 
@@ -165,7 +177,8 @@ def alternatives(declared: Conventions) -> tuple[Alternative, ...]:
 
 
 @lru_cache(maxsize=256)
-def _readings(declared: Conventions) -> Readings:
+def readings_of(declared: Conventions) -> Readings:
+    """Return the `alternatives` as arrays."""
     rows = alternatives(declared)
     return Readings(*(np.array([getattr(row, name) for row in rows]) for name in Readings._fields))
 

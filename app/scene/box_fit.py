@@ -85,7 +85,7 @@ def log_likelihoods(boxes: Boxes, readings: Readings) -> tuple[Float[NDArray, " 
         # A factor of all lengths leaves the places of boxes to each other as they are.
         fit = places
         if scale == 1.0:
-            fit = _fit_of_bottoms(centre, size, yaw, boxes.stands)
+            fit = fit_of_bottoms(centre, size, yaw, boxes.stands)
             fit += _REACHES * _overlaps(centre, size, yaw)
         if r == 0:
             places = fit
@@ -170,7 +170,7 @@ def _log_side(side: float) -> float:
 
 
 @compiled
-def _fit_of_bottoms(
+def fit_of_bottoms(
     centre: Float[NDArray, "n 3"],
     size: Float[NDArray, "n 3"],
     yaw: Float[NDArray, " n"],

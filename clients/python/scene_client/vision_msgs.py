@@ -326,6 +326,8 @@ class _Reader:
             self.note(sighting.index, "no-position", "the position is not finite or out of range")
             return {}
         fields = {"position": position} | ({"size": size} if size else {})
+        if (yaw := number(take(pose, "yaw"))) is not None:  # of a file, not of a message
+            return fields | {"yaw": math.remainder(yaw, math.tau)}
         turn = numbers(take(pose, "orientation"), "xyzw") or {}
         length = math.hypot(*turn.values())
         if _MIN_NORM < length < math.inf:
