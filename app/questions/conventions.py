@@ -63,6 +63,7 @@ class Alternative:
     sign: tuple[float, ...] = (1.0, 1.0, 1.0)
     side: tuple[int, ...] = (0, 1, 2)
     size: float = 1.0
+    place: float = 1.0
     scale: float = 1.0
     shift: Vector = (0.0, 0.0, 0.0)
     up: int = 0
@@ -172,6 +173,7 @@ def alternatives(declared: Conventions) -> tuple[Alternative, ...]:
         *(_of_unit(unit, declared, same) for unit in METRES if unit != declared.units),
         replace(same, message=_SCALED, log_prior=_RARE, scale=math.nan),
         *_of_extents(declared, same),
+        *(_of_places(unit, declared, same) for unit in METRES if unit != declared.units),
         *(_of_origin(point, declared, same) for point in get_args(BoxOrigin)),
     )
 
@@ -238,11 +240,21 @@ def _of_unit(unit: str, declared: Conventions, same: Alternative) -> Alternative
     return replace(same, message=message, declare={"units": unit}, scale=scale)
 
 
+def _of_places(unit: str, declared: Conventions, same: Alternative) -> Alternative:
+    """Return the reading with positions in a smaller unit; the declared one for a larger unit."""
+    place = METRES[unit] / METRES[declared.units]
+    if place > 1.0:
+        return same
+    message = f"{_BETTER}if positions alone are in {unit}; send all lengths in `units`"
+    return replace(same, message=message, log_prior=_RARE, place=place)
+
+
 def _of_extents(declared: Conventions, same: Alternative) -> tuple[Alternative, Alternative]:
     """Return the readings with sizes twice and half as large."""
     half = f"{_BETTER}if a size has half of each side: declare `extents` as half"
     full = f"{_BETTER}if a size has the whole sides: declare `extents` as full"
-    larger, smaller = replace(same, size=2.0), replace(same, size=0.5)
+    # A wrong label or an overlap is evidence for other sizes too, so these need more evidence.
+    larger, smaller = (replace(same, log_prior=_RARE, size=factor) for factor in (2.0, 0.5))
     if declared.extents == "full":
         larger = replace(larger, message=half, declare={"extents": "half"})
         return larger, replace(smaller, message=_DOUBLE)

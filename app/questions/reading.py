@@ -321,7 +321,7 @@ def _warnings(
     placed = [thing for thing in scene.objects if thing.position is not None]
     likely = _likely_reading(reading, scene, detections, request, stands)
     # Another unit explains all odd positions and sizes.
-    has_unit = likely is None or likely.scale == 1.0
+    has_unit = likely is None or likely.scale == likely.place == 1.0
     odd = [
         one
         for one in scene.objects

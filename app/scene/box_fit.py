@@ -58,6 +58,7 @@ class Readings(NamedTuple):
         sign: the signs of these axes.
         side: the sides of a box along these axes.
         size: factor of the sizes.
+        place: factor of the positions, at most 1.
         scale: factor of all lengths. NaN means the factor that fits the sizes best.
         shift: the way from the origin of an unrotated box to its centre, in halves of its sides.
         up: the axis of the frame that points up: 0 for z, 1 for y, 2 for -y.
@@ -67,6 +68,7 @@ class Readings(NamedTuple):
     sign: Float[NDArray[np.float64], "R 3"]
     side: Int[NDArray[np.int64], "R 3"]
     size: Float[NDArray[np.float64], "R"]
+    place: Float[NDArray[np.float64], "R"]
     scale: Float[NDArray[np.float64], "R"]
     shift: Float[NDArray[np.float64], "R 3"]
     up: Int[NDArray[np.int64], "R"]
@@ -86,6 +88,7 @@ def log_likelihoods(boxes: Boxes, readings: Readings) -> tuple[Float[NDArray, " 
         fit = places
         if scale == 1.0:
             fit = fit_of_bottoms(centre, size, yaw, boxes.stands)
+            fit += math.log(readings.place[r]) * _number(centre)  # density of the given heights
             fit += _REACHES * _overlaps(centre, size, yaw)
         if r == 0:
             places = fit
@@ -136,7 +139,7 @@ def _read(
                 side[0], side[1] = side[1], side[0]
             yaw[i], cos, sin = 0.0, 1.0, 0.0
         for k in range(3):
-            centre[i, k] = origin[readings.axis[r, k]] * readings.sign[r, k]
+            centre[i, k] = origin[readings.axis[r, k]] * readings.sign[r, k] * readings.place[r]
             size[i, k] = side[readings.side[r, k]] * readings.size[r]
         dx, dy = readings.shift[r, 0] * size[i, 0] / 2, readings.shift[r, 1] * size[i, 1] / 2
         centre[i, 0] += cos * dx - sin * dy
@@ -198,6 +201,15 @@ def fit_of_bottoms(
             total += math.log((1.0 - _ANYWHERE) * p + _ANYWHERE * 0.1)
         best = max(best, total)
     return best if best > -np.inf else 0.0
+
+
+@compiled
+def _number(centre: Float[NDArray, "n 3"]) -> int:
+    """Return the number of known positions."""
+    count = 0
+    for i in range(len(centre)):
+        count += not math.isnan(centre[i, 2])
+    return count
 
 
 @compiled
