@@ -28,6 +28,7 @@ _THIN: Final = 0.02  # sides in m below which the deviation does not count
 _CONTACT: Final = 0.04  # standard deviation of the gap between a bottom and its support in m
 _STANDS: Final = 0.6  # share of the objects of a stand that show it, within the errors of boxes
 _FREE: Final = 0.4  # density of other bottoms above the floor, per m
+_HIGH: Final = 3.0  # height in m of half of this density
 _SUNK: Final = 0.01  # density of bottoms below the floor, per m
 _ANYWHERE: Final = 0.03  # share of bottoms at any height
 _OVERLAP: Final = 0.05  # share of the smaller box above which two boxes overlap
@@ -194,7 +195,7 @@ def fit_of_bottoms(
             gap = centre[i, 2] - size[i, 2] / 2 - floor
             if math.isnan(gap):
                 continue
-            free = _FREE if gap > -1.5 * _CONTACT else _SUNK
+            free = _FREE / (1.0 + (gap / _HIGH) ** 2) if gap > -1.5 * _CONTACT else _SUNK
             on_floor = _STANDS / _CONTACT * _near(gap)
             carried = _STANDS * _STANDS / _CONTACT * touch[i] + (1 - _STANDS) * free
             p = stands[i, 0] * on_floor + stands[i, 1] * free + stands[i, 2] * carried

@@ -108,6 +108,18 @@ def test_a_factor_that_is_no_unit(factor: float) -> None:
     assert named == pytest.approx(factor, rel=0.25)
 
 
+def test_positions_in_another_unit_than_sizes() -> None:
+    scene = [*room(), *room()]
+    for k, one in enumerate(scene):
+        # Without different heights, all bottoms are equal at any scale.
+        height = one["size"][2] * (0.8 + 0.05 * k)
+        one["size"][2], one["position"][2] = height, height / 2
+        one["position"] = [10 * value for value in one["position"]]
+        one["position"][1] += 30 * (k // len(ROOM))
+    assert declared(scene) == {}
+    assert "positions alone are in dm" in warnings_of(scene)[0].message
+
+
 def test_few_sizes_show_no_convention() -> None:
     scene = room(lambda p: [value / 0.01 for value in p])
     robot = {"label": "robot", "size": [400, 400, 1000]}  # without a typical size

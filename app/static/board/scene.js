@@ -169,7 +169,7 @@ function readThing(entry, id, index, before, sizes) {
   const { position, size: extents, orientation: q } = found;
   const confidence = found.confidence ?? 1;
   fail(position && !AXES.every((axis) => isPlace(position[axis])), `${where} needs a position with numbers x, y, z within ±100 000 km.`);
-  fail(extents && !AXES.every((axis) => isExtent(extents[axis])), `${where} needs a size with numbers x, y, z from 0 to 10,000 km.`);
+  fail(extents && !AXES.every((axis) => isExtent(extents[axis])), `${where} needs a size with numbers x, y, z from 0 to 10 000 km.`);
   fail(!(isNumber(confidence) && confidence > 0 && confidence <= 1), `${where} has a confidence outside (0, 1].`);
   fail(q && !([q.x, q.y, q.z, q.w].every(isNumber) && Math.abs(Math.hypot(q.x, q.y, q.z, q.w) - 1) <= 0.01), `${where} has an orientation that is not a quaternion of length 1.`);
   const yaw = q ? (Math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z)) * 180) / Math.PI : 0;
