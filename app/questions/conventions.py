@@ -80,6 +80,8 @@ class Evidence:
     @property
     def likeliest(self) -> Alternative | None:
         """The likeliest reading, or None for the declared one."""
+        if self.log_odds.max() <= -_PRIOR:  # the usual case, and the fastest
+            return None
         total = self.log_odds + np.array([one.log_prior for one in self.alternatives])
         if abs(math.log(self.factor)) < _NOT_A_UNIT:
             total[[one.scale != one.scale for one in self.alternatives]] = -np.inf
@@ -173,8 +175,16 @@ def alternatives(declared: Conventions) -> tuple[Alternative, ...]:
         *(_of_unit(unit, declared, same) for unit in METRES if unit != declared.units),
         replace(same, message=_SCALED, log_prior=_RARE, scale=math.nan),
         *_of_extents(declared, same),
-        *(_of_places(unit, declared, same) for unit in METRES if unit != declared.units),
-        *(_of_origin(point, declared, same) for point in get_args(BoxOrigin)),
+        *(
+            _of_places(unit, declared, same)
+            for unit, metres in METRES.items()
+            if metres < METRES[declared.units]
+        ),
+        *(
+            _of_origin(point, declared, same)
+            for point in get_args(BoxOrigin)
+            if point != declared.box_origin
+        ),
     )
 
 
@@ -241,10 +251,8 @@ def _of_unit(unit: str, declared: Conventions, same: Alternative) -> Alternative
 
 
 def _of_places(unit: str, declared: Conventions, same: Alternative) -> Alternative:
-    """Return the reading with positions in a smaller unit; the declared one for a larger unit."""
+    """Return the reading with positions in a smaller unit."""
     place = METRES[unit] / METRES[declared.units]
-    if place > 1.0:
-        return same
     message = f"{_BETTER}if positions alone are in {unit}; send all lengths in `units`"
     return replace(same, message=message, log_prior=_RARE, place=place)
 
@@ -263,9 +271,7 @@ def _of_extents(declared: Conventions, same: Alternative) -> tuple[Alternative, 
 
 
 def _of_origin(point: BoxOrigin, declared: Conventions, same: Alternative) -> Alternative:
-    """Return the reading with another origin of boxes; the declared one for the same origin."""
-    if point == declared.box_origin:
-        return same
+    """Return the reading with another origin of boxes."""
     where = {"centre": "centre", "bottom": "middle of the bottom", "corner": "lowest corner"}
     message = f"{_BETTER}if positions are the {where[point]}: declare `box_origin` as {point}"
     prior = _PRIOR if point != "corner" else _PRIOR - 1.0

@@ -59,7 +59,7 @@ class Readings(NamedTuple):
         sign: the signs of these axes.
         side: the sides of a box along these axes.
         size: factor of the sizes.
-        place: factor of the positions, at most 1.
+        place: factor of the positions, at most 1. A smaller one needs heights of more than 3 m.
         scale: factor of all lengths. NaN means the factor that fits the sizes best.
         shift: the way from the origin of an unrotated box to its centre, in halves of its sides.
         up: the axis of the frame that points up: 0 for z, 1 for y, 2 for -y.
@@ -80,22 +80,51 @@ def log_likelihoods(boxes: Boxes, readings: Readings) -> tuple[Float[NDArray, " 
     """Return the log-likelihood of each reading, and the factor for a scale of NaN."""
     R, n = len(readings.size), len(boxes.yaw)
     result = np.empty(R)
-    centre, size, yaw = np.empty((n, 3)), np.empty((n, 3)), np.empty(n)
-    factor, places = _common_factor(boxes), 0.0
+    centre, size = np.empty((n, 3)), np.empty((n, 3))
+    cos, sin = np.empty(n), np.empty(n)
+    factor, is_tall = _common_factor(boxes), _height(boxes.centre) > _HIGH
+    log_typical = np.empty((n, 3))
+    for i in range(n):
+        for k in range(3):
+            log_typical[i, k] = math.log(max(boxes.typical[i, k], _THIN))
+    places = sizes = 0.0
     for r in range(R):
-        _read(boxes, readings, r, centre, size, yaw)
         scale = factor if math.isnan(readings.scale[r]) else readings.scale[r]
-        # A factor of all lengths leaves the places of boxes to each other as they are.
-        fit = places
-        if scale == 1.0:
-            fit = fit_of_bottoms(centre, size, yaw, boxes.stands)
-            fit += math.log(readings.place[r]) * _number(centre)  # density of the given heights
-            fit += _REACHES * _overlaps(centre, size, yaw)
+        place = readings.place[r]
+        if place < 1.0 and not is_tall:
+            result[r] = -np.inf  # a room is no smaller than its boxes
+            continue
+        fit_of_sizes, fit_of_places = sizes, places
+        if r == 0 or scale == 1.0:
+            _read(boxes, readings, r, centre, size, cos, sin)
+            # A factor of all lengths leaves the places of boxes to each other as they are.
+            fit_of_places = fit_of_bottoms(centre, size, cos, sin, boxes.stands)
+            fit_of_places += math.log(place) * _number(centre)  # density of the given heights
+            fit_of_places += _REACHES * _overlaps(centre, size, cos, sin)
+            if r == 0 or _has_other_sizes(readings, r):
+                fit_of_sizes = _fit_of_sizes(size, log_typical, boxes.spread, 0.0)
+        else:
+            fit_of_sizes = _fit_of_sizes(boxes.size, log_typical, boxes.spread, math.log(scale))
         if r == 0:
-            places = fit
-        fit += _fit_of_turns(boxes.turn, readings.up[r])
-        result[r] = fit + _fit_of_sizes(size, boxes.typical, boxes.spread, scale)
+            places, sizes = fit_of_places, fit_of_sizes
+        result[r] = fit_of_sizes + fit_of_places + _fit_of_turns(boxes.turn, readings.up[r])
     return result, factor
+
+
+@compiled
+def _has_other_sizes(readings: Readings, r: int) -> bool:
+    """Return whether the sizes of a reading differ from those of the first one."""
+    same = readings.side[r, 0] == 0 and readings.side[r, 1] == 1
+    return not same or readings.size[r] != 1.0
+
+
+@compiled
+def _height(centre: Float[NDArray, "n 3"]) -> float:
+    """Return the difference in height of the highest and the lowest centre."""
+    low, high = np.inf, -np.inf
+    for i in range(len(centre)):
+        low, high = min(low, centre[i, 2]), max(high, centre[i, 2])
+    return high - low
 
 
 @compiled
@@ -118,74 +147,78 @@ def _read(
     r: int,
     centre: Float[NDArray, "n 3"],
     size: Float[NDArray, "n 3"],
-    yaw: Float[NDArray, " n"],
+    cos: Float[NDArray, " n"],
+    sin: Float[NDArray, " n"],
 ) -> None:
-    """Write the boxes of reading r to the last three arguments."""
+    """Write the boxes of reading r, with cosine and sine of the yaw, to the last arguments."""
     is_same = True
     for k in range(3):
         is_same &= readings.axis[r, k] == k and readings.side[r, k] == k
     side, origin = np.empty(3), np.empty(3)
-    for i in range(len(yaw)):
-        yaw[i], cos, sin = boxes.yaw[i], math.cos(boxes.yaw[i]), math.sin(boxes.yaw[i])
+    for i in range(len(cos)):
+        c, s = math.cos(boxes.yaw[i]), math.sin(boxes.yaw[i])
         for k in range(3):
             side[k] = boxes.size[i, k]
         dx, dy = readings.shift[0, 0] * side[0] / 2, readings.shift[0, 1] * side[1] / 2
-        origin[0] = boxes.centre[i, 0] - (cos * dx - sin * dy)
-        origin[1] = boxes.centre[i, 1] - (sin * dx + cos * dy)
+        origin[0] = boxes.centre[i, 0] - (c * dx - s * dy)
+        origin[1] = boxes.centre[i, 1] - (s * dx + c * dy)
         origin[2] = boxes.centre[i, 2] - readings.shift[0, 2] * side[2] / 2
         if not (is_same or math.isnan(boxes.turn[i, 0])):
             # A yaw is about the upper axis of each reading, a quaternion about a fixed axis. So the
             # sides are those nearest to the axes of the frame.
-            if abs(sin) > abs(cos):
+            if abs(s) > abs(c):
                 side[0], side[1] = side[1], side[0]
-            yaw[i], cos, sin = 0.0, 1.0, 0.0
+            c, s = 1.0, 0.0
         for k in range(3):
             centre[i, k] = origin[readings.axis[r, k]] * readings.sign[r, k] * readings.place[r]
             size[i, k] = side[readings.side[r, k]] * readings.size[r]
         dx, dy = readings.shift[r, 0] * size[i, 0] / 2, readings.shift[r, 1] * size[i, 1] / 2
-        centre[i, 0] += cos * dx - sin * dy
-        centre[i, 1] += sin * dx + cos * dy
+        centre[i, 0] += c * dx - s * dy
+        centre[i, 1] += s * dx + c * dy
         centre[i, 2] += readings.shift[r, 2] * size[i, 2] / 2
+        cos[i], sin[i] = c, s
 
 
 @compiled
 def _fit_of_sizes(
     size: Float[NDArray, "n 3"],
-    typical: Float[NDArray, "n 3"],
+    log_typical: Float[NDArray, "n 3"],
     spread: Float[NDArray, " n"],
-    scale: float,
+    log_scale: float,
 ) -> float:
-    """Return the log-likelihood of sizes, up to a constant."""
+    """Return the log-likelihood of sizes times a factor, up to a constant."""
     total = 0.0
     for i in range(len(size)):
-        log_x, log_y = _log_side(size[i, 0] * scale), _log_side(size[i, 1] * scale)
-        typical_x, typical_y = _log_side(typical[i, 0]), _log_side(typical[i, 1])
-        flat = (log_x + log_y - typical_x - typical_y) / 2
-        high = _log_side(size[i, 2] * scale) - _log_side(typical[i, 2])
-        aspect = (abs(log_x - log_y) - abs(typical_x - typical_y)) / 2
+        x = _log_side(size[i, 0], log_scale)
+        y = _log_side(size[i, 1], log_scale)
+        z = _log_side(size[i, 2], log_scale)
+        flat = (x + y - log_typical[i, 0] - log_typical[i, 1]) / 2
+        high = z - log_typical[i, 2]
+        aspect = (abs(x - y) - abs(log_typical[i, 0] - log_typical[i, 1])) / 2
         square = (flat * flat + high * high) / spread[i] ** 2 + (aspect / _ASPECT) ** 2
         total -= (_DEGREES + 3) / 2 * math.log(1.0 + square / _DEGREES)
     return total
 
 
 @compiled
-def _log_side(side: float) -> float:
-    return math.log(max(side, _THIN))
+def _log_side(side: float, log_scale: float) -> float:
+    return max(math.log(max(side, 1e-9)) + log_scale, math.log(_THIN))
 
 
 @compiled
 def fit_of_bottoms(
     centre: Float[NDArray, "n 3"],
     size: Float[NDArray, "n 3"],
-    yaw: Float[NDArray, " n"],
+    cos: Float[NDArray, " n"],
+    sin: Float[NDArray, " n"],
     stands: Float[NDArray, "n 3"],
 ) -> float:
     """Return the log-likelihood of the bottoms of boxes with the likeliest floor.
 
     The floor is at the bottom of a box that usually stands on it. Without such a box, it is 0.
     """
-    n, best = len(yaw), -np.inf
-    touch = _contacts(centre, size, yaw)
+    n, best = len(cos), -np.inf
+    touch = _contacts(centre, size, cos, sin)
     for k in range(n):
         floor = centre[k, 2] - size[k, 2] / 2
         if math.isnan(floor) or stands[k, 0] < 0.5:
@@ -221,17 +254,19 @@ def _near(gap: float) -> float:
 
 @compiled
 def _contacts(
-    centre: Float[NDArray, "n 3"], size: Float[NDArray, "n 3"], yaw: Float[NDArray, " n"]
+    centre: Float[NDArray, "n 3"],
+    size: Float[NDArray, "n 3"],
+    cos: Float[NDArray, " n"],
+    sin: Float[NDArray, " n"],
 ) -> Float[NDArray, " n"]:
     """Return for each box how near its bottom is to the top of a box under its centre, 0 to 1."""
-    n = len(yaw)
+    n = len(cos)
     touch = np.zeros(n)
     for i in range(n):
-        cos, sin = math.cos(yaw[i]), math.sin(yaw[i])
         for j in range(n):
             dx, dy = centre[j, 0] - centre[i, 0], centre[j, 1] - centre[i, 1]
-            is_over = abs(cos * dx + sin * dy) <= size[i, 0] / 2
-            if i != j and is_over and abs(cos * dy - sin * dx) <= size[i, 1] / 2:
+            is_over = abs(cos[i] * dx + sin[i] * dy) <= size[i, 0] / 2
+            if i != j and is_over and abs(cos[i] * dy - sin[i] * dx) <= size[i, 1] / 2:
                 gap = centre[j, 2] - centre[i, 2] - (size[i, 2] + size[j, 2]) / 2
                 touch[j] = max(touch[j], _near(gap))
     return touch
@@ -239,20 +274,23 @@ def _contacts(
 
 @compiled
 def _overlaps(
-    centre: Float[NDArray, "n 3"], size: Float[NDArray, "n 3"], yaw: Float[NDArray, " n"]
+    centre: Float[NDArray, "n 3"],
+    size: Float[NDArray, "n 3"],
+    cos: Float[NDArray, " n"],
+    sin: Float[NDArray, " n"],
 ) -> float:
     """Return the number of pairs of boxes that reach into each other."""
-    n, count = len(yaw), 0.0
+    n, count = len(cos), 0.0
     for i in range(n):
-        cos, sin = math.cos(yaw[i]), math.sin(yaw[i])
         for j in range(i + 1, n):
             # The other box counts as the box around it in the axes of this box.
             dx, dy = centre[j, 0] - centre[i, 0], centre[j, 1] - centre[i, 1]
-            along, across = abs(math.cos(yaw[j] - yaw[i])), abs(math.sin(yaw[j] - yaw[i]))
+            along = abs(cos[i] * cos[j] + sin[i] * sin[j])
+            across = abs(cos[i] * sin[j] - sin[i] * cos[j])
             x = size[j, 0] * along + size[j, 1] * across
             y = size[j, 0] * across + size[j, 1] * along
-            common_x = _common(x, size[i, 0], abs(cos * dx + sin * dy))
-            common_y = _common(y, size[i, 1], abs(cos * dy - sin * dx))
+            common_x = _common(x, size[i, 0], abs(cos[i] * dx + sin[i] * dy))
+            common_y = _common(y, size[i, 1], abs(cos[i] * dy - sin[i] * dx))
             common_z = _common(size[j, 2], size[i, 2], abs(centre[j, 2] - centre[i, 2]))
             volume = size[i, 0] * size[i, 1] * size[i, 2]
             volume = min(volume, size[j, 0] * size[j, 1] * size[j, 2])

@@ -2,10 +2,10 @@
 
     python -m scripts.sense.conventions http://127.0.0.1:8000 DATA
 
-DATA is a folder with `procthor.jsonl.gz` and `extra/virtualhome.jsonl.gz`. The mistakes are made in 80 rooms of the test part of ProcTHOR, of which a
-viewer at a random place sees the nearest pieces. A mistake is named if the warning declares the
-field and the value that undo it. No field undoes sizes of twice the length: then the message must
-state that the sides are half as long. Right rooms and random parts of them show the false warnings.
+DATA is a folder with `procthor.jsonl.gz` and `extra/virtualhome.jsonl.gz`. The mistakes are made in
+80 rooms of the test part of ProcTHOR, of which a viewer at a random place sees the nearest pieces.
+A mistake is named if the warning declares the field and the value that undo it. If no field undoes
+it, the message must state it. Right rooms and random parts of them show the false warnings.
 
 Services up to 3.5.0 have a warning for each mistake that they know, without a value to declare. For
 these, the right code counts as named.
