@@ -279,7 +279,8 @@ class ContradictionError(RequestError, slug="contradictory-evidence", status=422
     """The scene contradicts itself.
 
     An object has a relation to itself, a pair has both a relation and its opposite (left and
-    right), or objects hold each other in a circle: a box on a book, and the book in the box.
+    right), or objects hold each other in a circle: a box on a book, and the book in the box. Or the
+    scene declares `up`, although its frame is optical, so that its y axis points down.
     """
 
     example = _example(

@@ -122,6 +122,7 @@ def _read(
         look_ups,
         roles=model.roles,
         spread=model.spread,
+        stands=None if model.places is None else model.places.stands,
         profiles=artifact.manifest.vocabulary.profiles,
         may_be_empty=question.samples,
     )

@@ -218,16 +218,15 @@ def rotated_offsets(
     missing: Int[NDArray, " n"],  # classes of the missing objects
     anchor: Int[NDArray, " n"],  # classes of the anchors
     outgoing: Bool[NDArray, " n"],  # whether the missing object is the relation's subject
-    axes: Float[NDArray, "3 3"],  # of the viewer, in the frame of the offsets
-    has_axes: bool,
+    axes: Float[NDArray, "3 3"],  # see `viewer_axes`, in the frame of the offsets
 ) -> tuple[Float[NDArray, "n 3"], Float[NDArray, "n 3"], Int[NDArray, " n"]]:
     """Return mean and standard deviation of the offset from each anchor to its missing object.
 
     Lengths are in metres. The third result is the number of training scenes with the two classes in
-    this relation, or `UNOBSERVED` for an unknown offset. Without axes, the viewing direction is
-    unknown: left and front have no offset, and the means of other offsets are vertical.
+    this relation, or `UNOBSERVED` for an unknown offset. If the first axis is zero, the viewing
+    direction is unknown: left and front have no offset, and other offsets have vertical means.
     """
-    n = len(relation)
+    n, has_direction = len(relation), axes[0].any()
     subject, object_ = np.empty(n, np.int64), np.empty(n, np.int64)
     for k in range(n):
         subject[k], object_[k] = missing[k], anchor[k]
@@ -236,7 +235,7 @@ def rotated_offsets(
     offset, scenes = _look_up_offsets(tables, relation, subject, object_)
     mean, variance, std = np.zeros((n, 3)), np.zeros((n, 3)), np.empty((n, 3))
     for k in range(n):
-        if has_axes:
+        if has_direction:
             for axis in range(3):
                 axis_mean, axis_variance = offset[k, axis], offset[k, 3 + axis] ** 2
                 for to in range(3):
@@ -245,12 +244,14 @@ def rotated_offsets(
         else:
             if relation[k] == LEFT or relation[k] == FRONT:
                 scenes[k] = UNOBSERVED
-            mean[k, 2], variance[k, 2] = offset[k, 2], offset[k, 5] ** 2
-            # Any horizontal direction is equally likely, so x and y share E[x²] + E[y²] equally.
-            for axis in range(2):
-                half = (offset[k, axis] ** 2 + offset[k, 3 + axis] ** 2) / 2
-                variance[k, 0] += half
-                variance[k, 1] += half
+            # Any horizontal direction is equally likely, so the two horizontal axes share
+            # E[x²] + E[y²] equally.
+            half = (offset[k, 0] ** 2 + offset[k, 3] ** 2) / 2
+            half += (offset[k, 1] ** 2 + offset[k, 4] ** 2) / 2
+            for to in range(3):
+                share = axes[2, to] ** 2
+                mean[k, to] = axes[2, to] * offset[k, 2]
+                variance[k, to] = share * offset[k, 5] ** 2 + (1.0 - share) * half
         for axis in range(3):
             value = mean[k, axis] if outgoing[k] else -mean[k, axis]
             # Adding 0.0 turns -0.0 into 0.0.

@@ -56,7 +56,7 @@ def missing(
     listed_as: Mapping[int, str] = MappingProxyType({}),  # the request's words for candidates
     at: tuple[str, int] | None = None,  # a place: (relation, index of the anchor object)
     coverage: float | None = None,  # listed share of the classes of the scene; None: unknown
-    axes: Axes | None = VIEWER,  # see `viewer_axes`; None: the viewing direction is unknown
+    axes: Axes = VIEWER,  # see `viewer_axes`
     details: bool = True,  # whether the answer contains `placements` and `because`
 ) -> Fields:
     """Rank the unlisted classes by the probability that they are present, likeliest first.
@@ -283,7 +283,7 @@ def _read(request: MissingRequest, model: SceneModel, reading: Reading) -> Optio
         "listed_as": listed_as,
         "at": at,
         "coverage": request.coverage,
-        "axes": viewer_axes(request.frame_id, None if view is None else view.yaw),
+        "axes": viewer_axes(request.frame_id, None if view is None else view.yaw, request.up),
         "details": request.detail == "full",
     }
 

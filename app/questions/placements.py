@@ -30,7 +30,6 @@ PLACES: Final = 3  # maximum number of placements in the answer for one class
 LEAST_SHARE: Final = 0.75  # least probability of a placement, as a share of the first placement
 LEAST_LIKELY: Final = 0.05  # least probability of a placement
 _SEEN_FROM_ANCHORS: Final = tuple(map(opposite, RELATIONS))
-_UNTURNED: Final = np.eye(3)
 
 
 class Place(NamedTuple):
@@ -64,7 +63,7 @@ def placements(
     posterior: Posterior,
     scene: Scene,
     candidates: Int[Indices, "N"],  # absent classes
-    axes: Axes | None,  # of the viewer; None: the viewing direction is unknown
+    axes: Axes,  # see `viewer_axes`
     at: Place | None = None,  # the requested place, which comes first in each result
 ) -> list[list[Fields]]:
     """Return the likeliest relations of each candidate to the listed objects, likeliest first.
@@ -115,8 +114,7 @@ def placements(
             candidates[rows],
             classes[columns],
             outgoing,
-            _UNTURNED if axes is None else np.array(axes),
-            axes is not None,
+            np.array(axes),
         )
         offsets = _offset_fields(mean, std, scenes)
     entries: list[list[Fields]] = [[] for _ in candidates]

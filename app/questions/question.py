@@ -103,12 +103,22 @@ _MAP: Final[dict[str, Any]] = {
     "frame_id": "map",
     "viewpoint": {"x": 0.0, "y": 0.0, "yaw": 0.0},
 }
+_Y_UP: Final[dict[str, Any]] = {
+    "objects": [
+        {"label": "desk", "position": [0.0, 0.0, -200.0], "size": [140.0, 80.0, 70.0]},
+        {"label": "lamp", "position": [-50.0, 80.0, -200.0], "size": [20.0, 40.0, 20.0]},
+    ],
+    "up": "y",
+    "units": "cm",
+    "box_origin": "bottom",
+}
 SCENES: Final[dict[str, Example]] = {
     "labels": Example("labels only", LABELS),
     "relations": Example("ids, a confidence, a stated relation, the room type", BEDROOM),
     "poses": Example("poses; the service derives the relations", POSES),
     "camera": Example("poses in a camera's optical frame, without sizes", _CAMERA),
     "map": Example("poses in a map, seen from a viewpoint", _MAP),
+    "conventions": Example("poses in other units, with another axis up", _Y_UP),
     "ignore": Example(
         "unknown labels are ignored",
         {"objects": ["bed", "nightstand", "flux capacitor"], "unknown_labels": "ignore"},

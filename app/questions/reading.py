@@ -1,7 +1,7 @@
 """Conversion of a request to a scene with ids, class indices and relations from poses.
 
-Warnings point out probable mistakes in poses and sizes: wrong units, a frame whose y axis points
-up, and quaternions in a wrong order. Some checks use the typical sizes of the classes.
+Warnings point out probable mistakes in poses and sizes. `app.questions.conventions` finds wrong
+units, axes, extents, origins of boxes and orders of quaternions.
 """
 
 import math
@@ -19,6 +19,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from app.errors import ContradictionError, InvalidRequestError, Location
+from app.questions.conventions import Alternative, evidence_of, fields_to_declare
 from app.questions.names import ErrorList, LookUps, Names, Unknown
 from app.scene.relation_table import RelationTable, Triple
 from app.scene.roles import RoleCounts
@@ -33,8 +34,9 @@ from app.scene.scene import (
     observe,
 )
 from app.scene.spatial_relations import CANONICAL, canonicalise, support_cycle
-from app.scene.vocabulary import Vocabulary
-from scene_client.frames import body_pose, is_optical, is_world_fixed
+from app.scene.vocabulary import Extents, Vocabulary
+from scene_client import schemas
+from scene_client.frames import METRES, Conventions, is_optical, is_world_fixed
 from scene_client.schemas import (
     Detection,
     ObservedRelation,
@@ -79,6 +81,7 @@ def read_scene(
     *,
     roles: RoleCounts | None = None,  # see `derive_relations`
     spread: Float[NDArray[np.floating], "V"] | None = None,  # see `observe`
+    stands: Float[NDArray[np.floating], "V 3"] | None = None,  # `Places.stands`
     profiles: Sequence[str] = (),  # names of the model's profiles
     may_be_empty: bool = False,  # whether a scene without objects of known classes is valid
 ) -> Reading:
@@ -123,7 +126,7 @@ def read_scene(
         in_frame, view = reading.scene, request.viewpoint
         reading.scene = observe(
             in_frame,
-            viewpoint=None if view is None else Viewpoint(view.x, view.y, view.yaw),
+            viewpoint=None if view is None else _viewpoint(view, request),
             has_viewer=view is not None or not is_world_fixed(request.frame_id),
             typical_sizes=vocabulary.sizes,
             spread=spread,
@@ -136,7 +139,7 @@ def read_scene(
                 ObservedRelation(objects[i].id, CANONICAL[a], objects[j].id)  # type: ignore[arg-type]
                 for a, i, j in relations.triples
             ]
-        reading.warnings = _warnings(reading, in_frame, detections, request)
+        reading.warnings = _warnings(reading, in_frame, detections, request, stands)
     return reading
 
 
@@ -151,7 +154,11 @@ def _objects(
 
     Ignored objects are added to ``left_out``.
     """
-    optical = is_optical(request.frame_id)
+    try:
+        conventions = Conventions.of(request, request.frame_id)
+    except ValueError as error:
+        errors.add(ContradictionError, ("up",), str(error))
+        return (), {}
     objects: list[SceneObject] = []
     detections: dict[int, Detection] = {}
     for number, (name, entry) in enumerate(zip(ids, request.objects, strict=True)):
@@ -166,18 +173,27 @@ def _objects(
             objects.append(SceneObject(name, label, index))
         else:
             detections[len(objects)] = entry
-            position, size, turn, yaw = None, None, None, 0.0
-            if (extents := entry.size) is not None:
-                size = (extents.x, extents.y, extents.z)
-            if (centre := entry.position) is not None:
-                if entry.yaw is not None:
-                    turn = (0.0, 0.0, math.sin(entry.yaw / 2), math.cos(entry.yaw / 2))
-                elif (quaternion := entry.orientation) is not None:
-                    turn = (quaternion.x, quaternion.y, quaternion.z, quaternion.w)
-                centre_in_frame = (centre.x, centre.y, centre.z)
-                position, size, yaw = body_pose(centre_in_frame, size, turn, optical=optical)
+            known = unknown.vocabulary.objects
+            typical = known[index].size if index < len(known) else None
+            position, size, yaw = _box(entry, conventions, typical)
             objects.append(SceneObject(name, label, index, entry.confidence, position, size, yaw))
     return tuple(objects), detections
+
+
+def _box(
+    entry: Detection, conventions: Conventions, typical: Extents | None
+) -> tuple[Point | None, Point | None, float]:
+    """Return centre, size and yaw of a detection in body axes."""
+    position = None if (p := entry.position) is None else (p.x, p.y, p.z)
+    size = None if (s := entry.size) is None else (s.x, s.y, s.z)
+    turn = None if (q := entry.orientation) is None else (q.x, q.y, q.z, q.w)
+    return conventions.box(position, size, turn, entry.yaw, typical=typical)
+
+
+def _viewpoint(view: schemas.Viewpoint, request: SceneRequest) -> Viewpoint:
+    """Return the viewpoint of a request in metres."""
+    metres = METRES[request.units]
+    return Viewpoint(view.x * metres, view.y * metres, view.yaw)
 
 
 def _profile(name: str, profiles: Sequence[str], errors: ErrorList) -> int | None:
@@ -277,32 +293,15 @@ def _triples(
 
 _ORIGIN: Final[Point] = (0.0, 0.0, 0.0)
 _SAME_DEPTH: Final = 1e-3  # maximum difference in m of depths that count as equal
-_LEAST: Final = 3  # minimum number of objects for warnings about all objects of a scene
-_FURNITURE: Final = 0.5  # minimum longest side of furniture in m; smaller objects may lie or stand
-_MOST: Final = 0.75  # minimum share of the objects that agree on a mistake
-_UNIT: Final = math.log(2.5)  # minimum log ratio to the typical sizes that means another unit
-_TWICE: Final = math.log(2.0)  # log ratio that is more than the spread within a class
-_BETTER: Final = math.log(1.5)  # minimum mean advantage of the y extents over the z extents
-_UPRIGHT: Final = 0.05  # maximum component of a quaternion that counts as 0
+_LEAST_FLAT: Final = 3  # minimum number of objects of a flat scene
 
 _TOO_FAR: Final = (
-    f"the object is more than {MOST_DISTANT:g} m from the viewer; positions must be in metres"
+    f"the object is more than {MOST_DISTANT:g} m from the viewer; the unit of positions may differ "
+    "from `units`"
 )
 _ODD_SIZE: Final = (
     f"all sides of the object are below {SMALLEST * 1e3:g} mm, so its size is unknown, or a side "
-    f"is above {LARGEST:g} m; sizes must be in metres"
-)
-_SCALED: Final = (
-    "the sizes of these objects are about {:.2g} times the typical sizes of their classes; sizes "
-    "must be in metres"
-)
-_Y_UP: Final = (
-    "the sizes of these objects fit their classes only if the y axis points up; convert positions, "
-    "sizes and orientations to a frame whose z axis points up"
-)
-_ROLLED: Final = (
-    "these objects lie on their sides, but their sizes fit upright objects; the order of a "
-    "quaternion is x, y, z, w, and the z axis of an optical frame points ahead"
+    f"is above {LARGEST:g} m; the unit of sizes may differ from `units`"
 )
 _FLAT: Final = "all objects have the same depth along the optical axis; the depth may be missing"
 _UNSIZED: Final = (
@@ -310,53 +309,80 @@ _UNSIZED: Final = (
     "class has no typical size"
 )
 
-# A piece of furniture, and three misfits. The proportion of a box is its height, divided by the
-# geometric mean of the two other sides. A misfit is the absolute log ratio of the proportion to the
-# typical proportion, so it does not depend on the unit. The height is the extent along z of the
-# scene, along y of the scene, and along the z axis of the box.
-_Fit = tuple[SceneObject, float, float, float]
-
 
 def _warnings(
     reading: Reading,
     scene: Scene,
     detections: Mapping[int, Detection],  # by index in the scene, without bare labels
     request: SceneRequest,
+    stands: Float[NDArray[np.floating], "V 3"] | None,
 ) -> list[SceneWarning]:
     """Return the warnings about a scene in the frame of the request (x forward, y left, z up)."""
     # Python loops are fast enough, because most scenes have no poses or pass all checks.
     classes = reading.vocabulary.objects
     placed = [thing for thing in scene.objects if thing.position is not None]
-    sized, fits = _compared(scene, detections, reading.vocabulary)
-    factor, scaled = _scaled(sized)
+    likely = _likely_reading(reading, scene, detections, request, stands)
+    # Another unit explains all odd positions and sizes.
+    has_unit = likely is None or likely.scale == likely.place == 1.0
     odd = [
         one
         for one in scene.objects
-        if one.size is not None and not SMALLEST <= max(one.size) <= LARGEST and one not in scaled
+        if one.size is not None and not SMALLEST <= max(one.size) <= LARGEST
     ]
-    rolled = _rolled(fits, detections)
-    optical = is_optical(request.frame_id)
-    y_up = () if optical else _y_up([fit for fit in fits if fit[0] not in rolled])
     unsized = [
         one
         for one in placed
         if one.size is None and (one.class_index is None or classes[one.class_index].size is None)
     ]
     are_derived = reading.observed is not None and len(placed) > 1
+    is_flat = is_optical(request.frame_id) and _is_flat(placed)
     kinds: list[tuple[WarningCode, str, Sequence[SceneObject]]] = [
-        ("implausible-position", _TOO_FAR, _distant(placed, request)),
-        ("implausible-size", _ODD_SIZE, odd),
-        ("implausible-scale", _SCALED.format(factor), scaled),
-        ("y-axis-up", _Y_UP, y_up),
-        ("rolled-objects", _ROLLED, rolled),
-        ("flat-scene", _FLAT, placed if optical and _is_flat(placed) else ()),
+        ("implausible-position", _TOO_FAR, _distant(placed, request) if has_unit else ()),
+        ("implausible-size", _ODD_SIZE, odd if has_unit else ()),
+        ("flat-scene", _FLAT, placed if is_flat else ()),
         ("unknown-sizes", _UNSIZED, unsized if are_derived else ()),
     ]
-    return [
+    warnings: list[SceneWarning] = []
+    if likely is not None:
+        declare = fields_to_declare(likely, request.frame_id)
+        warnings = [
+            SceneWarning(code="convention", message=likely.message, objects=[], declare=declare)
+        ]
+    return warnings + [
         SceneWarning(code=code, message=message, objects=[thing.id for thing in objects])
         for code, message, objects in kinds
         if objects
     ]
+
+
+def _likely_reading(
+    reading: Reading,
+    scene: Scene,
+    detections: Mapping[int, Detection],
+    request: SceneRequest,
+    stands: Float[NDArray[np.floating], "V 3"] | None,
+) -> Alternative | None:
+    """Return the likeliest reading of the boxes, or None for the declared conventions."""
+    classes = reading.vocabulary.objects
+    turns = {
+        row: (q.x, q.y, q.z, q.w)
+        for row, one in detections.items()
+        if (q := one.orientation) is not None
+    }
+
+    def reread(conventions: Conventions) -> list[SceneObject]:
+        """Return the objects under other conventions."""
+        objects = list(scene.objects)
+        for row in turns:
+            index = objects[row].class_index
+            typical = None if index is None else classes[index].size
+            position, size, yaw = _box(detections[row], conventions, typical)
+            objects[row] = replace(objects[row], position=position, size=size, yaw=yaw)
+        return objects
+
+    declared = Conventions.of(request, request.frame_id)
+    evidence = evidence_of(scene.objects, turns, declared, reading.vocabulary, stands, reread)
+    return None if evidence is None else evidence.likeliest
 
 
 def _distant(placed: Sequence[SceneObject], request: SceneRequest) -> list[SceneObject]:
@@ -364,7 +390,8 @@ def _distant(placed: Sequence[SceneObject], request: SceneRequest) -> list[Scene
     positions = [thing.position or _ORIGIN for thing in placed]
     centre = _ORIGIN
     if request.viewpoint is not None:
-        centre = (request.viewpoint.x, request.viewpoint.y, 0.0)
+        x, y, _ = _viewpoint(request.viewpoint, request)
+        centre = (x, y, 0.0)
     elif placed and is_world_fixed(request.frame_id):
         x, y, z = map(median, zip(*positions, strict=True))
         centre = (x, y, z)
@@ -375,70 +402,4 @@ def _distant(placed: Sequence[SceneObject], request: SceneRequest) -> list[Scene
 def _is_flat(placed: Sequence[SceneObject]) -> bool:
     """Return whether all objects have the same depth, the distance along the optical axis."""
     depths = [thing.position[0] for thing in placed if thing.position is not None]
-    return len(depths) >= _LEAST and max(depths) - min(depths) <= _SAME_DEPTH
-
-
-def _compared(
-    scene: Scene, detections: Mapping[int, Detection], vocabulary: Vocabulary
-) -> tuple[list[tuple[SceneObject, float]], list[_Fit]]:
-    """Compare sizes with the typical sizes of the classes, without thin objects.
-
-    Return each object of known size with the mean log ratio of its sides to the typical sides, and
-    the fits of the furniture with a position.
-    """
-    sized, fits = list[tuple[SceneObject, float]](), list[_Fit]()
-    for number, detection in detections.items():
-        thing, own = scene.objects[number], detection.size
-        typical = None if thing.class_index is None else vocabulary.objects[thing.class_index].size
-        if thing.size is None or typical is None or min(thing.size) < SMALLEST:
-            continue
-        volume_ratio = math.prod(thing.size) / math.prod(typical)
-        sized.append((thing, math.log(volume_ratio) / 3))
-        if own is None or thing.position is None or max(typical) < _FURNITURE:
-            continue
-        x, y, z = thing.size
-        # The yaw decides which side of the box is nearer to the y axis.
-        along_y = x if abs(math.sin(thing.yaw)) > abs(math.cos(thing.yaw)) else y
-        # The square of a proportion is height³ / volume.
-        by_z, by_y, by_own_z = (
-            abs(math.log((height / typical[2]) ** 3 / volume_ratio)) / 2
-            for height in (z, along_y, own.z)
-        )
-        fits.append((thing, by_z, by_y, by_own_z))
-    return sized, fits
-
-
-def _scaled(sized: Sequence[tuple[SceneObject, float]]) -> tuple[float, list[SceneObject]]:
-    """Return the common factor of sizes and typical sizes, and its objects if it is implausible."""
-    if len(sized) < _LEAST:
-        return 1.0, []
-    centre = median(scale for _, scale in sized)
-    if abs(centre) < _UNIT:
-        return 1.0, []
-    agreeing = [thing for thing, scale in sized if abs(scale - centre) <= _TWICE]
-    agree = len(agreeing) >= max(_LEAST, _MOST * len(sized))
-    return math.exp(centre), agreeing if agree else []
-
-
-def _rolled(fits: Sequence[_Fit], detections: Mapping[int, Detection]) -> list[SceneObject]:
-    """Return the furniture that lies on its side, although it fits its class upright.
-
-    One object may really have fallen over. So the list is empty, unless it has several objects, or
-    all quaternions of the scene are turns about the vertical if w is read first.
-    """
-    rolled = [thing for thing, by_z, _, by_own_z in fits if by_own_z <= _TWICE <= by_z - by_own_z]
-    if not rolled or len(rolled) >= _LEAST:
-        return rolled
-    turns = [one.orientation for one in detections.values() if one.orientation is not None]
-    w_is_first = turns and all(max(abs(turn.y), abs(turn.z)) <= _UPRIGHT for turn in turns)
-    return rolled if w_is_first else []
-
-
-def _y_up(fits: Sequence[_Fit]) -> list[SceneObject]:
-    """Return the furniture that fits its class better if y points up, if most furniture does."""
-    advantages = [by_z - by_y for _, by_z, by_y, _ in fits]
-    total = sum(advantages)
-    agree = total >= _MOST * sum(map(abs, advantages))
-    if len(advantages) < _LEAST or not agree or total < _BETTER * len(advantages):
-        return []
-    return [thing for (thing, *_), better in zip(fits, advantages, strict=True) if better > 0]
+    return len(depths) >= _LEAST_FLAT and max(depths) - min(depths) <= _SAME_DEPTH

@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import Final, Self
 
 from app import errors
-from app.questions import QUESTIONS
+from app.questions import QUESTIONS, conventions
 from app.questions.answer import written
 from app.registry import Artifact, ArtifactError, ModelSet, StoreError
 from app.registry.model_set import EMPTY
@@ -185,6 +185,8 @@ def warm_up(artifact: Artifact) -> None:
     bare = replace(related, relations=None)
     posed = observe(bare, typical_sizes=model.vocabulary.sizes)
     try:
+        stands = None if model.places is None else model.places.stands
+        conventions.warm_up(model.vocabulary, stands)
         for question in QUESTIONS:
             for answer in question.warm_up(model, (related, bare, posed)):
                 written(answer)

@@ -95,7 +95,7 @@ NO_SCENES: list[tuple[Any, str]] = [
     ({"objects": [{"label": "bed", "size": [-1, 1, 1]}]}, "numbers x, y, z from 0"),
     ({"objects": [{"id": "a", "label": "bed"}] * 2}, "another object"),
     ({"objects": [{"label": "bed", "position": [1e9, 0, 0]}]}, "100 000 km"),
-    ({"objects": [{"label": "bed", "size": [2e4, 1, 1]}]}, "10 km"),
+    ({"objects": [{"label": "bed", "size": [2e7, 1, 1]}]}, "10 000 km"),
     ({"objects": ["bed"], "relations": [None]}, "Relation 1 must have a subject"),
     ({"objects": ["bed"], "relations": [["bed", "constructor", "bed"]]}, "one of left, right"),
     ({"objects": ["bed"], "relations": [["rug", "under", "bed"]]}, "outside the scene: rug"),
@@ -194,3 +194,13 @@ def test_labels_and_supports_are_read(board: Board) -> None:
         board.put(json.dumps({"scene_id": "one", "objects": objects, "relations": relations}))
         stated = {"subject": "1", "relation": "on-top", "object": "0"}
         assert board.scene["relations"] == [stated]
+
+
+def test_boxes_in_other_conventions_are_left_out(board: Board) -> None:
+    desk = {"label": "desk", "position": [2, 0, 0.4], "size": [0.7, 1.4, 0.8]}
+    objects = [desk, {**desk, "id": "desk_2"}]
+    board.put(json.dumps({"objects": objects, "units": "m"}))
+    assert placed(board) == ["desk", "desk_2"]
+    board.put(json.dumps({"objects": objects, "units": "cm"}))
+    expect(board.page.locator("#note")).to_contain_text("declared conventions")
+    assert placed(board) == []

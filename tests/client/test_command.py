@@ -196,6 +196,23 @@ def test_the_key_of_the_environment(scene: Any, peer: Any, monkeypatch: pytest.M
     assert b"x-api-key: " + b"k" * 16 in heads[0].lower()
 
 
+def test_options_declare_the_conventions_of_a_file(scene: Any, tmp_path: Path) -> None:
+    """A chair beside a bed, as z up in metres, and as y up in centimetres at the bottom."""
+    plain, other = tmp_path / "plain.csv", tmp_path / "other.csv"
+    head = "label,x,y,z,sx,sy,sz,yaw\n"
+    plain.write_text(f"{head}bed,2,1,.4,2,1.6,.8,.5\nchair,2,-.5,.45,.5,.6,.9,0\n")
+    other.write_text(f"{head}bed,-100,0,-200,160,80,200,.5\nchair,50,0,-200,60,90,50,0\n")
+    options = ("--up", "y", "--units", "cm", "--box-origin", "bottom", "--json")
+    usual, declared = (
+        scene("relations", str(plain), "--json"),
+        scene("relations", str(other), *options),
+    )
+    assert declared.exit_code == 0, declared.stderr
+    answers = [json.loads(done.stdout) | {"request_id": ""} for done in (usual, declared)]
+    assert answers[0]["observed_relations"]
+    assert answers[0] == answers[1]
+
+
 @pytest.mark.parametrize(
     ("words", "expected"),
     [

@@ -192,6 +192,16 @@ def test_the_training_derives_the_relations_of_the_service(frame, places, turn):
     }
 
 
+def test_declared_conventions_are_recorded_in_metres_with_z_up() -> None:
+    bed = {"label": "bed", "position": [2, 1, 0.4], "size": [2, 1.6, 0.8], "yaw": 0.5}
+    told = {"label": "bed", "position": [-100, 0, -200], "size": [80, 40, 100], "yaw": 0.5}
+    view = {"x": 50.0, "y": -25.0, "yaw": 0.1}
+    fields = {"up": "y", "units": "cm", "extents": "half", "box_origin": "bottom"}
+    declared = scene_of(request(told, "lamp", viewpoint=view, **fields))
+    view = {"x": 0.5, "y": -0.25, "yaw": 0.1}
+    assert declared["objects"] == scene_of(request(bed, "lamp", viewpoint=view))["objects"]
+
+
 def test_a_map_without_a_viewpoint() -> None:
     boxes = box("bed", 1, 2, 0.25), box("lamp", 3, 2, 0.25)
     scene = scene_of(request(*boxes, frame_id="robot/map"))

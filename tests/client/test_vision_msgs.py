@@ -125,7 +125,7 @@ def bed(**fields: Any) -> dict[str, Any]:
         (bed(size=(0, 1, 1)), BED | UPRIGHT | {"size": {"x": 0, "y": 1, "z": 1}}, None),
         *[
             (bed(size=size), BED | UPRIGHT, None)
-            for size in ((0, 0, 0), (1, -1, 1), (1, 1, math.nan), (1, 1, 1e5))
+            for size in ((0, 0, 0), (1, -1, 1), (1, 1, math.nan), (1, 1, 1e8))
         ],
         # Quaternions get the length 1.
         (bed(turn=(0, 0, 0, 2)), SIZED | UPRIGHT, None),

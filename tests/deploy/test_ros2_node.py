@@ -100,6 +100,16 @@ def test_detections_are_answered(run: Run, live: LiveService, recorded: Any) -> 
     assert {marker.header.frame_id for marker in shown} == {"base_link"}
 
 
+def test_parameters_declare_conventions(run: Run, live: LiveService, recorded: Any) -> None:
+    running = run(url=live.url, timeout=60.0, units="cm", up="y")
+    assert running.node.advisor.conventions == {"units": "cm", "up": "y"}
+    for entry in recorded.detections:
+        for vector in (entry.bbox.center.position, entry.bbox.size):
+            for axis in "xyz":
+                setattr(vector, axis, 100 * getattr(vector, axis))
+    assert running.answer(recorded)["missing"]
+
+
 def test_the_api_key_comes_from_a_file(run: Run, recorded: Any, tmp_path: Path) -> None:
     (tmp_path / "key").write_text("incorrect-zebra-capacitor-nail\n")
     for file in (str(tmp_path / "key"), ""):

@@ -236,20 +236,23 @@ REQUEST: dict[str, Any] = {
 
 
 @pytest.mark.parametrize(
-    ("frame", "viewpoint"),
+    ("frame", "viewpoint", "up"),
     [
-        (None, None),
-        ("base_link", None),
-        ("map", {"x": 4.0, "y": -3.0, "yaw": math.pi / 2}),
-        ("camera_optical_frame", None),
-        ("robot_1/map", None),
+        (None, None, None),
+        ("base_link", None, None),
+        ("map", {"x": 4.0, "y": -3.0, "yaw": math.pi / 2}, None),
+        ("camera_optical_frame", None, None),
+        ("robot_1/map", None, None),
+        ("base_link", None, "y"),
+        ("map", None, "y"),
+        ("map", {"x": 4.0, "y": -3.0, "yaw": math.pi / 2}, "y"),
     ],
 )
-async def test_offsets_are_in_the_axes_of_the_frame(measured, frame, viewpoint):
+async def test_offsets_are_in_the_axes_of_the_frame(measured, frame, viewpoint, up):
     """In a map without a viewpoint, the relations left and front have no offset."""
-    options = {"frame_id": frame, "viewpoint": viewpoint}
+    options = {"frame_id": frame, "viewpoint": viewpoint, "up": up}
     options = {name: value for name, value in options.items() if value is not None}
-    axes = viewer_axes(frame or "", None if viewpoint is None else viewpoint["yaw"])
+    axes = viewer_axes(frame or "", None if viewpoint is None else viewpoint["yaw"], up)
     answer = await ask(measured, "missing", **REQUEST, **options)
     position = tuple(PLACE.values())
     things = (
@@ -262,7 +265,41 @@ async def test_offsets_are_in_the_axes_of_the_frame(measured, frame, viewpoint):
     assert answer["missing"] == expected["missing"]
     places = [place for entry in answer["missing"] for place in entry["placements"]]
     kinds = {"offset" in place for place in places}
-    assert kinds == ({True, False} if axes is None else {True})
+    assert kinds == ({True, False} if not any(axes[0]) else {True})
+
+
+CONVENTIONS = {"up": "y", "units": "cm", "extents": "half", "box_origin": "bottom"}
+
+
+@pytest.mark.parametrize("question", ["relations", "outliers", "missing", "rooms"])
+async def test_a_scene_in_other_conventions_has_the_same_answer(measured, question):
+    """A desk and a lamp on it, seen from a viewpoint in a map: z up in metres, and y up in cm."""
+    boxes = (("desk", (2.0, 0.5, 0.4), (0.7, 1.4, 0.8)), ("lamp", (2.0, 0.8, 1.0), (0.2, 0.3, 0.4)))
+    plain, other = [], []
+    for label, (x, y, z), (a, b, c) in boxes:
+        plain.append({"label": label, "position": [x, y, z], "size": [a, b, c], "yaw": 0.3})
+        place, half = (-100 * y, 100 * (z - c / 2), -100 * x), (50 * b, 50 * c, 50 * a)
+        other.append({"label": label, "position": place, "size": half, "yaw": 0.3})
+    view = {"x": 0.5, "y": -0.25, "yaw": 0.1}
+    usual = await ask(measured, question, objects=plain, frame_id="map", viewpoint=view)
+    view = {"x": 50.0, "y": -25.0, "yaw": 0.1}
+    answer = await ask(
+        measured, question, objects=other, frame_id="map", viewpoint=view, **CONVENTIONS
+    )
+    # Only offsets are in the axes of the frame.
+    for one in (usual, answer):
+        one.pop("request_id")
+        for entry in one.get("missing", ()):
+            for place in entry["placements"]:
+                place.pop("offset", None)
+    assert answer == usual
+
+
+async def test_up_in_an_optical_frame_is_refused(measured):
+    body = {"objects": REQUEST["objects"], "frame_id": "camera_optical_frame", "up": "z"}
+    response = await measured.post("/outliers", json=body)
+    (error,) = problem(response, 422, "contradictory-evidence")["errors"]
+    assert error["pointer"] == "#/up"
 
 
 ENTRIES: list[Any] = [

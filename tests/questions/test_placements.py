@@ -110,8 +110,7 @@ VIEWER = viewer_axes()
 
 def offset_of(relation, missing, anchor, outgoing=True, axes=VIEWER, offsets=OFFSETS):
     ends = (np.array([value]) for value in (relation, missing, anchor, outgoing))
-    rotation = np.eye(3) if axes is None else np.array(axes)
-    values = rotated_offsets(offsets.tables, *ends, rotation, axes is not None)
+    values = rotated_offsets(offsets.tables, *ends, np.array(axes))
     mean, std, scenes = (value[0].tolist() for value in values)
     return None if scenes == UNOBSERVED else Offset(tuple(mean), tuple(std), scenes)
 
@@ -141,8 +140,8 @@ def test_the_offset_turns_with_the_viewer(yaw, optical):
 
 def test_unknown_offsets():
     """Left and front without a viewer, and relations without poses in training."""
-    assert offset_of(LEFT, 1, 2, axes=None) is None
-    assert offset_of(FRONT, 1, 2, outgoing=False, axes=None) is None
+    assert offset_of(LEFT, 1, 2, axes=viewer_axes("map")) is None
+    assert offset_of(FRONT, 1, 2, outgoing=False, axes=viewer_axes("map")) is None
     none = {"pair": np.zeros(0, np.int64), "pair_offset": np.zeros((0, 6), "f4")}
     counts = {"relation_scenes": np.array([1, 0, 9, 9, 9]), "pair_scenes": np.zeros(0, np.int64)}
     partial = replace(OFFSETS, **counts, **none)

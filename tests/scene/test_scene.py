@@ -26,7 +26,14 @@ from app.scene.spatial_relations import (
     support_cycle,
 )
 from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN, Heights, floor_level, stands_of
-from scene_client.frames import body_pose, is_optical, is_world_fixed, viewer_axes
+from scene_client.frames import (
+    METRES,
+    Conventions,
+    is_optical,
+    is_world_fixed,
+    optical_name,
+    viewer_axes,
+)
 from scene_client.schemas import RelationName
 from tests.scene.test_geometry import LABELS, role_counts
 from training.datasets.encoding import pool_instances
@@ -301,7 +308,7 @@ def test_frames_by_name(frame: str, optical: bool, fixed: bool) -> None:
 
 def test_optical_axes() -> None:
     # 3 m ahead, 1 m to the right, 2 m below the camera.
-    position, size, yaw = body_pose((1.0, 2.0, 3.0), (0.1, 0.2, 0.3), optical=True)
+    position, size, yaw = Conventions("-y").box((1.0, 2.0, 3.0), (0.1, 0.2, 0.3))
     assert position == (3.0, -1.0, -2.0)
     # Unturned in optical axes: x is its width, y its height, z its depth.
     assert size == (0.3, 0.1, 0.2)
@@ -318,7 +325,7 @@ def test_a_box_on_its_side(angle: float, tilt: float) -> None:
         # A tilt about the heading leaves it level.
         lean = Rotation.from_euler("ZXZ", [heading, tilt, -heading])
         turn = lean * Rotation.from_euler(f"Z{axis}", [angle, math.pi / 2])
-        _, upright, yaw = body_pose((0.0, 0.0, 0.0), (1.0, 2.0, 3.0), turn.as_quat().tolist())
+        _, upright, yaw = Conventions().box(None, (1.0, 2.0, 3.0), turn.as_quat().tolist())
         assert upright == size
         assert same_turn(yaw, heading)
 
@@ -327,7 +334,7 @@ def test_a_box_on_its_side(angle: float, tilt: float) -> None:
 def test_a_tilt_is_dropped(tilt: float, angle: float) -> None:
     # Yaw after a tilt about the box's own x axis leaves that axis horizontal.
     both = Rotation.from_euler("ZX", [angle, tilt])
-    _, size, yaw = body_pose((0.0, 0.0, 0.0), (1.0, 2.0, 3.0), both.as_quat().tolist())
+    _, size, yaw = Conventions().box(None, (1.0, 2.0, 3.0), both.as_quat().tolist())
     assert size == (1.0, 2.0, 3.0)
     assert same_turn(yaw, angle)
 
@@ -335,14 +342,86 @@ def test_a_tilt_is_dropped(tilt: float, angle: float) -> None:
 @pytest.mark.parametrize("quaternion", [(0, 0, 0, 0), (0, 0, 0, 2), (0, 0, 0, math.nan)])
 def test_quaternions_must_have_length_one(quaternion: tuple[float, float, float, float]) -> None:
     with pytest.raises(ValueError, match="quaternion of length 1"):
-        body_pose((0.0, 0.0, 0.0), None, quaternion)
+        Conventions().box((0.0, 0.0, 0.0), None, quaternion)
 
 
-@given(st.floats(-7, 7), st.booleans(), st.tuples(*[st.floats(-5, 5)] * 3))
-def test_viewer_axes_invert_the_conversion_to_the_viewer(yaw, optical, point):
+@given(st.floats(-7, 7), st.sampled_from(["z", "y", "-y"]), st.tuples(*[st.floats(-5, 5)] * 3))
+def test_viewer_axes_invert_the_conversion_to_the_viewer(yaw, up, point):
     """A point read into body axes, seen by the viewer, and told in the frame again."""
-    body, _, _ = body_pose(point, optical=optical)
+    body, _, _ = Conventions(up).box(point)
     (seen,), _ = to_viewer_frame([body], Viewpoint(0.0, 0.0, yaw))
-    axes = viewer_axes("camera_optical_frame" if optical else "map", yaw)
+    frame = "camera_optical_frame" if up == "-y" else "map"
+    axes = viewer_axes(frame, yaw, "y" if up == "y" else None)
     told = [sum(seen[k] * axes[k][n] for k in range(3)) for n in range(3)]
     assert told == pytest.approx(point, abs=1e-9)
+
+
+def test_a_viewer_without_a_direction_knows_only_what_is_up():
+    unknown = (0.0, 0.0, 0.0)
+    assert viewer_axes("map") == (unknown, unknown, (0.0, 0.0, 1.0))
+    assert viewer_axes("map", up="y") == (unknown, unknown, (0.0, 1.0, 0.0))
+
+
+# A frame with y up: x right, y up, z towards the viewer.
+TO_Y_UP = Rotation.from_matrix([[0, -1, 0], [0, 0, 1], [-1, 0, 0]])
+boxes = st.tuples(*[st.floats(-5, 5)] * 3), st.tuples(*[st.floats(0.1, 3)] * 3), st.floats(-3, 3)
+
+
+@given(
+    *boxes,
+    st.sampled_from(["z", "y"]),
+    st.sampled_from(sorted(METRES)),
+    st.sampled_from(["full", "half"]),
+    st.sampled_from(["centre", "bottom", "corner"]),
+    st.sampled_from(["xyzw", "wxyz", "yaw"]),
+)
+def test_every_convention_describes_the_same_box(
+    centre, size, yaw, up, units, extents, origin, order
+):
+    """A box in body axes, told under other conventions and read again."""
+    turn = Rotation.from_euler("Z", yaw)
+    shares = {"centre": (0, 0, 0), "bottom": (0, 0, -0.5), "corner": (-0.5, -0.5, -0.5)}[origin]
+    sides = np.array(size)
+    if up == "y":
+        sides, turn = sides[[1, 2, 0]], TO_Y_UP * turn * TO_Y_UP.inv()
+        # The smallest z of a box is ahead.
+        shares = (shares[0] * -1, shares[1] * -1, shares[2])
+    told = np.array(centre) + Rotation.from_euler("Z", yaw).apply(np.array(shares) * size)
+    told = TO_Y_UP.apply(told) if up == "y" else told
+    metres = METRES[units]
+    q = np.roll(turn.as_quat(), order == "wxyz").tolist()
+    read = Conventions(up, units, extents, origin, "xyzw" if order == "yaw" else order).box(
+        tuple((told / metres).tolist()),
+        tuple((sides / metres / (2 if extents == "half" else 1)).tolist()),
+        *((None, yaw) if order == "yaw" else (tuple(q), None)),
+    )
+    assert read[0] == pytest.approx(centre, abs=1e-9)
+    assert read[1] == pytest.approx(size)
+    assert same_turn(read[2], yaw)
+
+
+@pytest.mark.parametrize("up", ["z", "y"])
+def test_a_typical_size_leads_from_the_bottom_to_the_centre(up):
+    place, size, _ = Conventions(up, "cm", box_origin="bottom").box(
+        (0.0, 0.0, 0.0), typical=(2.0, 1.0, 0.6)
+    )
+    assert place == (0.0, 0.0, 0.3)
+    assert size is None
+    # Without any size, the origin counts as the centre.
+    assert Conventions(up, box_origin="corner").box((0.0, 0.0, 0.0))[0] == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("frame", "optical", "body"),
+    [
+        (None, "camera_optical", "camera"),
+        ("map", "map_optical", "map"),
+        ("cam_optical_frame", "cam_optical", "cam"),
+        ("cam_optical", "cam_optical", "cam"),
+    ],
+)
+def test_names_of_frames_with_and_without_optical_axes(frame, optical, body):
+    assert optical_name(frame, optical=True) == optical
+    assert optical_name(frame, optical=False) == body
+    assert is_optical(optical)
+    assert not is_optical(body)

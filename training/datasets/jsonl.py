@@ -18,6 +18,7 @@ from typing import Annotated, Any, Final
 from pydantic import BaseModel, BeforeValidator, ConfigDict, StrictBool, StrictInt, ValidationError
 
 from app.scene.scene import SMALLEST
+from scene_client.frames import BoxOrigin, Conventions, Extents, QuaternionOrder, Units, Up
 from scene_client.schemas import Stamp
 from training.datasets.files import position_and_problem, read_lines
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError, Id, Text
@@ -60,6 +61,11 @@ class _Line(BaseModel):
     false_relations: list[_Triple] | None = None
     counts: dict[str, StrictInt] | None = None
     viewer_frame: StrictBool | None = None
+    up: Up | None = None
+    units: Units = "m"
+    extents: Extents = "full"
+    box_origin: BoxOrigin = "centre"
+    quaternion_order: QuaternionOrder = "xyzw"  # scenes have no quaternions
     stamp: Stamp | None = None  # checked, but not used
     confirmed: StrictBool = False
 
@@ -124,7 +130,8 @@ def _parse_scene(line: bytes, default_id: str) -> AnnotatedScene:
     """Return the scene of a line. One without `scene_id` gets the default."""
     values = _Line.model_validate_json(line.removeprefix(codecs.BOM_UTF8))
     scene_id, source = values.scene_id or default_id, values.source
-    objects = _objects(values.objects, values.counts or {})
+    conventions = Conventions.of(values)
+    objects = _objects(values.objects, values.counts or {}, conventions)
     stated, denied = (
         _indices(x or (), objects) for x in (values.relations, values.false_relations)
     )
@@ -140,13 +147,17 @@ def _parse_scene(line: bytes, default_id: str) -> AnnotatedScene:
         false_relations=relations_of(source, denied),
         supported=supported_subjects(source, stated),
         confirmed=values.confirmed,
+        conventions=conventions,
     )
 
 
 def _objects(
-    entries: Sequence[dict[str, Any]], counts: Mapping[str, int]
+    entries: Sequence[dict[str, Any]], counts: Mapping[str, int], conventions: Conventions
 ) -> tuple[AnnotatedObject, ...]:
-    """Return the objects. One without id is called by its label, with a number if needed."""
+    """Return the objects, in metres and with z up.
+
+    One without id is called by its label, with a number if needed.
+    """
     labels = Counter(str(entry.get("label")) for entry in entries)
     nameless = Counter(str(entry.get("label")) for entry in entries if entry.get("id") is None)
     ids = {str(entry["id"]) for entry in entries if entry.get("id") is not None}
@@ -167,11 +178,19 @@ def _objects(
                 f"counts contains the label {label!r}, which needs exactly one object, but the "
                 f"scene has {labels[label]}"
             )
+    things = _Objects.model_validate({"objects": complete}).objects
+    return tuple(_in_metres(thing, conventions) for thing in things)
+
+
+def _in_metres(thing: AnnotatedObject, conventions: Conventions) -> AnnotatedObject:
+    """Return an object in metres and with z up. Its y axis may have pointed up before."""
+    if conventions != Conventions():
+        position, size, yaw = conventions.box(thing.position, thing.size, yaw=thing.yaw)
+        thing = replace(thing, position=position, size=size, yaw=yaw)
     # Sides that are all below 1 mm mean an unknown size, as in a request.
-    return tuple(
-        replace(thing, size=None) if thing.size and max(thing.size) < SMALLEST else thing
-        for thing in _Objects.model_validate({"objects": complete}).objects
-    )
+    if thing.size and max(thing.size) < SMALLEST:
+        thing = replace(thing, size=None)
+    return thing
 
 
 def _indices(

@@ -12,6 +12,7 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from app.scene import RELATIONS
+from scene_client.frames import Conventions
 
 Box2d = tuple[float, float, float, float]
 
@@ -112,6 +113,8 @@ class AnnotatedScene:
     # True for a recorded scene that a person has confirmed. The digest of a data source does not
     # depend on it.
     confirmed: bool = field(default=False, repr=False)
+    # The conventions that the file declares. The poses of the objects are in metres, with z up.
+    conventions: Conventions = field(default=Conventions(), repr=False)
 
     def __post_init__(self) -> None:
         """Check that ids are distinct, and that supports and relations name objects."""

@@ -31,8 +31,9 @@ from training.datasets.records import digest_of
 from training.datasets.vocabulary import left_out_line
 from training.domain.adaptation import FEWEST, Adapted, Measured, adapted
 from training.domain.home import JUDGED, Home, confirmed_scene
+from training.domain.look import of_convention
 from training.domain.material import read_material
-from training.domain.terminal import ROWS, StorePath, console, fail, print_lines
+from training.domain.terminal import ROWS, StorePath, console, fail, print_finding, print_lines
 from training.evaluation.metrics import Ratio
 from training.fit.configuration import ConfigError
 from training.runs.example_scenes import choose_examples
@@ -91,6 +92,8 @@ def adapt_command(
             home = Home.of(parent.model, recorded, places)
             _print_home(home, parent)
             print_lines(*filter(None, [left_out_line(material.left_out, ROWS)]))
+            if (finding := of_convention(recorded)).count:
+                print_finding(finding)
             result = adapted(home, seed=seed, progress=status.update)
         _print_result(result)
         if result.model is None:

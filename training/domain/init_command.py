@@ -19,7 +19,7 @@ from training.datasets.vocabulary import left_out_line, vocabulary_json
 from training.domain.look import Label
 from training.domain.material import read_material
 from training.domain.proposal import Proposal, propose
-from training.domain.terminal import ROWS, console, fail, listing, print_lines
+from training.domain.terminal import ROWS, console, fail, listing, print_finding, print_lines
 from training.domain.update import PROPOSED, proposed_json, update
 from training.fit.configuration import ConfigError
 from training.runs.config_files import shipped_configs
@@ -168,10 +168,7 @@ def _show(proposal: Proposal, classes: str) -> None:
     print_lines(*lines)
     console.print("Please check:" if facts.findings else "no contradictions found")
     for finding in facts.findings:
-        console.print(f"  [yellow]{finding.count}[/yellow] × {finding.what}")
-        console.print(f"    {finding.advice}")
-        for example in finding.examples:
-            console.print(f"    - {example}", markup=False)
+        print_finding(finding)
     if proposal.warning:
         console.print(f"[yellow]warning:[/yellow] {proposal.warning}", soft_wrap=True)
 

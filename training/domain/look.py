@@ -17,6 +17,7 @@ from app.scene.spatial_relations import ABOVE, ON_TOP
 from training.datasets import AnnotatedScene, EncodedScene
 from training.datasets.sources import source_of
 from training.datasets.vocabulary import curated_names, most_frequent
+from training.domain.conventions import likely_convention
 
 SHOWN = 5  # maximum number of examples in a finding; further cases are only counted
 
@@ -152,11 +153,20 @@ def _findings(
             and any(thing.position for thing in scene.objects)
         ),
     )
+    yield of_convention(scenes)
     yield finding(
         f"Positions are beyond {MOST_DISTANT:g} m, or sides of objects beyond {LARGEST:g} m.",
-        "Positions and sizes must be in metres.",
+        "Positions and sizes must be in metres, or in the declared `units`.",
         (scene.scene_id for scene in scenes if _beyond_metres(scene)),
     )
+
+
+def of_convention(scenes: Iterable[AnnotatedScene]) -> Finding:
+    """Return the finding about the conventions of the boxes of scenes."""
+    reading, cases = likely_convention(scenes)
+    what = "The boxes of scenes probably follow another convention."
+    advice = "" if reading is None else f"{reading.message[0].upper()}{reading.message[1:]}."
+    return Finding(what, advice, len(cases), [scene.scene_id for scene in cases[:SHOWN]])
 
 
 def _beyond_metres(scene: AnnotatedScene) -> bool:

@@ -14,6 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from app.registry import RegistryError
 from training.datasets.records import InvalidLinesError
+from training.domain.look import Finding
 from training.fit.trainer import SCORES, CurvePoint, Trainer
 
 ROWS: Final = 12  # maximum number of entries of a printed list
@@ -95,3 +96,11 @@ def next_steps(folder: Path) -> None:
         f"next: python -m training compare {folder} --store my-store",
         f"      python -m training publish {folder} 1.0.0 --store my-store --promote",
     )
+
+
+def print_finding(finding: Finding) -> None:
+    """Print a property of the scenes that the user should check."""
+    console.print(f"  [yellow]{finding.count}[/yellow] × {finding.what}")
+    console.print(f"    {finding.advice}")
+    for example in finding.examples:
+        console.print(f"    - {example}", markup=False)

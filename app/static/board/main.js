@@ -45,7 +45,7 @@ const OPENING = 4; // labels that the board shows for a model without examples
  */
 function put(scene, change = {}, line = newLine()) {
   const sizes = sizesOf(store.get(), store.get().models[0]);
-  const { things, viewer, room, relations, optical } = fromScene(scene, sizes);
+  const { things, viewer, room, relations, foreign } = fromScene(scene, sizes);
   const boxes = things.map(sizer(sizes));
   const [fixed, free] = [boxes.filter(({ placed }) => placed), boxes.filter(({ placed }) => !placed)];
   const hanging = hangingOf(store.get(), store.get().models[0]);
@@ -60,7 +60,7 @@ function put(scene, change = {}, line = newLine()) {
     relations, posed: !relations.length && things.some(({ placed }) => placed),
     viewer, room, selected: null, at: null, draft: null, ...change,
   });
-  note(optical ? 'The board leaves out positions in the optical frame of a camera.' : '');
+  note(foreign);
 }
 
 function note(words) {

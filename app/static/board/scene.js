@@ -54,7 +54,7 @@ function poseOf({ x, y, z, yaw, size }) {
 
 /** Limits of the service: coordinate and extent in metres, heading in radians, number of objects. */
 const FARTHEST = 1e8;
-const LARGEST = 1e4;
+const LARGEST = 1e7;
 const MOST_TURNED = 1e3;
 export const MOST_OBJECTS = 256;
 export const FULL = `A scene can have at most ${MOST_OBJECTS} objects. Remove one first.`;
@@ -67,6 +67,8 @@ function fail(condition, words) {
 }
 
 const SMALLEST = 1e-3; // metres
+/** The conventions of the boxes on the board. */
+const CONVENTIONS = { up: 'z', units: 'm', extents: 'full', box_origin: 'centre', quaternion_order: 'xyzw' };
 const isNumber = (value) => typeof value === 'number' && Number.isFinite(value);
 const AXES = ['x', 'y', 'z'];
 const isPlace = (value) => isNumber(value) && Math.abs(value) <= FARTHEST;
@@ -74,7 +76,7 @@ const isExtent = (value) => isNumber(value) && value >= 0 && value <= LARGEST;
 
 /**
  * Reads a scene of the API.
- * @returns {{things: Thing[], viewer: object, room: string, relations: object[], optical: boolean}}
+ * @returns {{things: Thing[], viewer: object, room: string, relations: object[], foreign: string}}
  * @throws {SceneError}
  */
 export function fromScene(scene, sizes) {
@@ -85,17 +87,21 @@ export function fromScene(scene, sizes) {
   const entries = scene.objects.map(spelledOut);
   const ids = idsOf(entries);
   entries.forEach((entry, index) => things.push(readThing(entry, ids[index], index, things, sizes)));
-  const optical = /_optical(_frame)?$/.test(scene.frame_id ?? '');
   // In the optical frame of a camera, x and y have other directions than on the board.
-  if (optical) for (const thing of things) thing.placed = false;
+  const optical = /_optical(_frame)?$/.test(scene.frame_id ?? '');
+  const declared = Object.entries(CONVENTIONS).some(([name, usual]) => (scene[name] ?? usual) !== usual);
+  if (optical || declared) for (const thing of things) thing.placed = false;
+  if (declared) for (const thing of things) thing.size = null;
   const { x = 0, y = 0, yaw = 0 } = scene.viewpoint ?? {};
   fail(!(isPlace(x) && isPlace(y)), 'The viewpoint needs numbers x and y within ±100 000 km.');
   fail(!(isNumber(yaw) && Math.abs(yaw) <= MOST_TURNED), 'The viewpoint needs a yaw within ±1000 radians.');
   fail(!Array.isArray(scene.relations ?? []), '"relations" must be a list.');
   const relations = [...(scene.relations ?? []).map(readRelation(things)), ...supports(entries, ids, things)];
+  let foreign = optical ? 'The board leaves out positions in the optical frame of a camera.' : '';
+  if (declared) foreign = 'The board leaves out boxes with declared conventions, such as other units.';
   const room = scene.room_type ?? '';
   fail(typeof room !== 'string', 'The room type must be a text.');
-  return { things, viewer: { x, y, yaw }, room, relations: distinct(relations), optical };
+  return { things, viewer: { x, y, yaw }, room, relations: distinct(relations), foreign };
 }
 
 /** An object with vectors as objects, its yaw as a quaternion, and a number as id. */
@@ -163,7 +169,7 @@ function readThing(entry, id, index, before, sizes) {
   const { position, size: extents, orientation: q } = found;
   const confidence = found.confidence ?? 1;
   fail(position && !AXES.every((axis) => isPlace(position[axis])), `${where} needs a position with numbers x, y, z within ±100 000 km.`);
-  fail(extents && !AXES.every((axis) => isExtent(extents[axis])), `${where} needs a size with numbers x, y, z from 0 to 10 km.`);
+  fail(extents && !AXES.every((axis) => isExtent(extents[axis])), `${where} needs a size with numbers x, y, z from 0 to 10 000 km.`);
   fail(!(isNumber(confidence) && confidence > 0 && confidence <= 1), `${where} has a confidence outside (0, 1].`);
   fail(q && !([q.x, q.y, q.z, q.w].every(isNumber) && Math.abs(Math.hypot(q.x, q.y, q.z, q.w) - 1) <= 0.01), `${where} has an orientation that is not a quaternion of length 1.`);
   const yaw = q ? (Math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z)) * 180) / Math.PI : 0;

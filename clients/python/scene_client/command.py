@@ -31,6 +31,7 @@ from scene_client.errors import (
 )
 from scene_client.files import from_file, is_file, label_map_of
 from scene_client.formats import from_data
+from scene_client.frames import CONVENTIONS, BoxOrigin, Extents, QuaternionOrder, Units, Up
 from scene_client.offline import OfflineClient
 from scene_client.ros_fields import MessageError
 from scene_client.schemas import Detail, RelationName, Sensitivity, UnknownLabels
@@ -39,7 +40,10 @@ from scene_client.sync import Client
 REFUSED, MEANINGLESS, UNREACHABLE, LATE, BUSY, FAILED = range(1, 7)
 
 _FLAGS: Final = ("--json",)
-_VALUED: Final = ("--url", "--model", "--offline", "--timeout", "--record")
+_VALUED: Final = (
+    *("--url", "--model", "--offline", "--timeout", "--record"),
+    *(f"--{name.replace('_', '-')}" for name in CONVENTIONS),
+)
 _RELATIONS: Final = get_args(RelationName)
 _MAX_NOTES: Final = 10  # maximum number of printed notes on a file
 
@@ -88,6 +92,7 @@ class Options:
     timeout: float
     as_json: bool
     record: Path | None
+    conventions: dict[str, str]
 
     def client(self) -> Client:
         """Return the client that sends the question."""
@@ -156,13 +161,32 @@ def main(
             metavar="SCENES.jsonl", help="Append the scene to this file, in the training format."
         ),
     ] = None,
+    up: Annotated[
+        Up | None, typer.Option(help="Axis of the frame that points up.", show_default="z")
+    ] = None,
+    units: Annotated[Units | None, typer.Option(help="Unit of lengths.", show_default="m")] = None,
+    extents: Annotated[
+        Extents | None,
+        typer.Option(help="Sizes are whole sides or half of each.", show_default="full"),
+    ] = None,
+    box_origin: Annotated[
+        BoxOrigin | None,
+        typer.Option(help="The point of a box at its position.", show_default="centre"),
+    ] = None,
+    quaternion_order: Annotated[
+        QuaternionOrder | None, typer.Option(help="Order of quaternions.", show_default="xyzw")
+    ] = None,
     version: Annotated[  # noqa: ARG001 — the callback prints the version
         bool,
         typer.Option("--version", help="Print the version.", callback=_version, is_eager=True),
     ] = False,
 ) -> None:
     """Store the general options for the subcommand."""
-    context.obj = Options(url, model, offline, timeout, json, record)
+    conventions = _named(
+        up=up, units=units, extents=extents, box_origin=box_origin,
+        quaternion_order=quaternion_order,
+    )  # fmt: skip
+    context.obj = Options(url, model, offline, timeout, json, record, conventions)
 
 
 # ---------------------------------------------------------------------------------- questions
@@ -226,7 +250,9 @@ def relations(
     label_map: LabelMap = None,
 ) -> None:
     """List the likely spatial relations between the objects."""
-    scene = _scene(things, label_map, relations, room_type=room_type, unknown_labels=unknown_labels)
+    scene = _scene(
+        context, things, label_map, relations, room_type=room_type, unknown_labels=unknown_labels
+    )
     request = scene | _named(
         top_k=top_k, min_probability=min_probability, include_opposites=include_opposites or None
     )
@@ -255,7 +281,9 @@ def missing(
     detail: HowMuch = None,
 ) -> None:
     """List objects that the scene probably lacks, and their likely places."""
-    scene = _scene(things, label_map, relations, room_type=room_type, unknown_labels=unknown_labels)
+    scene = _scene(
+        context, things, label_map, relations, room_type=room_type, unknown_labels=unknown_labels
+    )
     place = None if at is None else _anchor(at)
     request = scene | _named(
         top_k=top_k, coverage=coverage, at=place, candidates=candidates or None, detail=detail
@@ -281,7 +309,9 @@ def outliers(
     detail: HowMuch = None,
 ) -> None:
     """List objects that do not fit the scene, and relations that are probably false."""
-    scene = _scene(things, label_map, relations, room_type=room_type, unknown_labels=unknown_labels)
+    scene = _scene(
+        context, things, label_map, relations, room_type=room_type, unknown_labels=unknown_labels
+    )
     request = scene | _named(sensitivity=sensitivity, threshold=threshold, detail=detail)
     _show(context, lambda client: client.outliers(request), tables.outliers)
 
@@ -299,7 +329,7 @@ def rooms(
     detail: HowMuch = None,
 ) -> None:
     """List the likely types of the room, or where one object usually is."""
-    scene = _scene(things, label_map, unknown_labels=unknown_labels)
+    scene = _scene(context, things, label_map, unknown_labels=unknown_labels)
     request = scene | _named(top_k=top_k, candidates=candidates or None, detail=detail)
     _show(context, lambda client: client.rooms(request), tables.rooms)
 
@@ -324,7 +354,9 @@ def generate(
 ) -> None:
     """Sample scenes that contain the given objects."""
     things = things or []
-    scene = _scene(things, label_map, relations, room_type=room_type, unknown_labels=unknown_labels)
+    scene = _scene(
+        context, things, label_map, relations, room_type=room_type, unknown_labels=unknown_labels
+    )
     request = scene | _named(count=count, seed=seed, steps=steps, temperature=temperature)
     _show(context, lambda client: client.generate(request), tables.generate)
 
@@ -356,6 +388,7 @@ def ready(context: typer.Context) -> None:
 
 
 def _scene(
+    context: typer.Context,
     things: list[str] | None,
     label_map: str | None,
     stated: list[str] | None = None,
@@ -381,7 +414,8 @@ def _scene(
     if (more := len(scene.notes) - _MAX_NOTES) > 0:
         print(f"{files[0]}: {more} more notes of this kind", file=sys.stderr)
     relations = [_relation(text) for text in stated] if stated else None
-    return scene | _named(relations=relations, **options)
+    general: Options = context.obj
+    return scene | general.conventions | _named(relations=relations, **options)
 
 
 def _named(**options: Any) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from secrets import token_hex
 from time import localtime, strftime, time_ns
 from typing import TYPE_CHECKING, Any, Final
 
-from scene_client.frames import Vector, body_pose, is_optical, is_world_fixed
+from scene_client.frames import METRES, Conventions, Vector, is_world_fixed
 
 if TYPE_CHECKING:
     from scene_client.schemas import SceneRequest, Viewpoint
@@ -28,7 +28,9 @@ def scene_of(
 ) -> dict[str, Any]:
     """Return the scene of a request in the training format, with the current time by default.
 
-    Positions are in the axes of the viewer, except in world-fixed frames without a viewpoint. The
+    Positions are in metres and in the axes of the viewer, except in world-fixed frames without a
+    viewpoint: then they are in body axes. If the size of a box is unknown, its origin counts as its
+    centre. The
     training takes unlisted relations for false, so relations are listed only if the request states
     all of them. Otherwise, on-top becomes `supported_by`, and the other relations are left out.
     """
@@ -37,9 +39,9 @@ def scene_of(
     if request.room_type is not None:
         scene["room_type"] = request.room_type
     things = likely(request) if things is None else things
-    optical = is_optical(request.frame_id)
+    conventions = Conventions.of(request, request.frame_id)
     scene["objects"] = objects = [
-        _object(name, thing, request.viewpoint, optical)
+        _object(name, thing, request.viewpoint, conventions)
         for name, thing in zip(_ids(things), things, strict=True)
     ]
     if request.relations is not None or any("supported_by" in thing for thing in objects):
@@ -115,28 +117,26 @@ def _ids(things: Sequence[Thing]) -> list[str]:
     return ids
 
 
-def _object(name: str, entry: Thing, view: Viewpoint | None, optical: bool) -> dict[str, Any]:
+def _object(
+    name: str, entry: Thing, view: Viewpoint | None, conventions: Conventions
+) -> dict[str, Any]:
     """Return an object in the training format. `supported_by` is an id or a label."""
     thing: dict[str, Any] = {"id": name, "label": entry["label"]}
-    size: Vector | None = None
-    yaw = 0.0
-    if (one := entry.get("size")) is not None:
-        size = one.x, one.y, one.z
-    if (one := entry.get("position")) is not None:
-        place, turn = (one.x, one.y, one.z), None
-        if (angle := entry["yaw"]) is not None:
-            turn = (0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2))
-        elif (q := entry["orientation"]) is not None:
-            turn = (q.x, q.y, q.z, q.w)
-        place, size, yaw = body_pose(place, size, turn, optical=optical)
+    place, size, yaw = conventions.box(
+        None if (one := entry.get("position")) is None else (one.x, one.y, one.z),
+        None if (one := entry.get("size")) is None else (one.x, one.y, one.z),
+        None if (one := entry.get("orientation")) is None else (one.x, one.y, one.z, one.w),
+        entry.get("yaw"),
+    )
+    if place is not None:
         if view is not None:
-            cos, sin = math.cos(view.yaw), math.sin(view.yaw)
-            x, y = place[0] - view.x, place[1] - view.y
+            cos, sin, metres = math.cos(view.yaw), math.sin(view.yaw), METRES[conventions.units]
+            x, y = place[0] - metres * view.x, place[1] - metres * view.y
             place, yaw = (x * cos + y * sin, y * cos - x * sin, place[2]), yaw - view.yaw
         thing["position"] = _rounded(place)
     if size is not None:
         thing["size"] = _rounded(size)
-    if yaw:
+    if place is not None and yaw:
         thing["yaw"] = round(math.remainder(yaw, math.tau), 4)
     if (support := entry.get("supported_by")) is not None:
         thing["supported_by"] = support

@@ -55,9 +55,14 @@ def box_between(xs: Iterable[Any], ys: Iterable[Any], theta: float = 0.0) -> dic
     return image_box((left + right) / 2, (top + bottom) / 2, right - left, bottom - top, theta)
 
 
-def solid_box(centre: Any, size: Any, turn: Any = NO_TURN) -> dict[str, Any]:
-    """Return the field ``bbox`` of a box in metres. Each value is a sequence or None."""
-    pose = {"position": _named("xyz", centre), "orientation": _named("xyzw", turn)}
+def solid_box(
+    centre: Any, size: Any, turn: Any = NO_TURN, *, yaw: float | None = None
+) -> dict[str, Any]:
+    """Return the field ``bbox`` of a box. Each value is a sequence or None.
+
+    ``yaw`` is the rotation about the axis that points up in radians, instead of ``turn``.
+    """
+    pose = {"position": _named("xyz", centre), "orientation": _named("xyzw", turn), "yaw": yaw}
     return {"bbox": {"center": pose, "size": _named("xyz", size)}}
 
 

@@ -43,7 +43,7 @@ MAX_RELATIONS: Final = 4096
 """Default limits of the service for one scene."""
 
 _MAX_LABEL, _MAX_ID, _MAX_FRAME = 100, 128, 256
-_MAX_METRES, _MAX_EXTENT, _MAX_YAW = 1e8, 1e4, 1e3
+_MAX_METRES, _MAX_EXTENT, _MAX_YAW = 1e8, 1e7, 1e3
 # A quaternion shorter than this length counts as unset.
 _MIN_NORM: Final = 1e-6
 
@@ -326,6 +326,8 @@ class _Reader:
             self.note(sighting.index, "no-position", "the position is not finite or out of range")
             return {}
         fields = {"position": position} | ({"size": size} if size else {})
+        if (yaw := number(take(pose, "yaw"))) is not None:  # of a file, not of a message
+            return fields | {"yaw": math.remainder(yaw, math.tau)}
         turn = numbers(take(pose, "orientation"), "xyzw") or {}
         length = math.hypot(*turn.values())
         if _MIN_NORM < length < math.inf:

@@ -67,8 +67,8 @@ def _row(line: int, row: Mapping[str, str]) -> dict[str, Any]:
     box: dict[str, Any] = {}
     if any(row.get(axis) for axis in "xyz"):
         sizes = [value(f"s{axis}") for axis in "xyz"]
-        turn = turn_of(value("yaw") or 0.0)
-        box = solid_box([value(axis) for axis in "xyz"], None if None in sizes else sizes, turn)
+        size = None if None in sizes else sizes
+        box = solid_box([value(axis) for axis in "xyz"], size, yaw=value("yaw"))
     elif any(row.get(name) for name in _CORNERS):
         left, top, right, bottom = map(value, _CORNERS)
         box = box_between((left, right), (top, bottom))

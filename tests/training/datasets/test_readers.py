@@ -155,6 +155,22 @@ def test_older_files_of_bedrooms_have_viewer_axes(tmp_path: Path) -> None:
     assert scene.viewer_frame is True
 
 
+def test_declared_conventions_become_metres_with_z_up(tmp_path: Path) -> None:
+    """A frame whose y axis points up, centimetres, half extents, and positions at the bottom."""
+    bed = {"label": "bed", "position": [-100, 0, -300], "size": [80, 30, 100], "yaw": 0.5}
+    fields = {"up": "y", "units": "cm", "extents": "half", "box_origin": "bottom"}
+    (scene,) = read_scenes(write_scene(tmp_path, objects=[bed], **fields))
+    (thing,) = scene.objects
+    assert thing.position == pytest.approx((3.0, 1.0, 0.3))
+    assert thing.size == pytest.approx((2.0, 1.6, 0.6))
+    assert thing.yaw == pytest.approx(0.5)
+    jsonl.write_jsonl([scene], tmp_path / "again.jsonl")
+    (again,) = read_scenes(tmp_path / "again.jsonl")
+    assert again == replace(scene, conventions=again.conventions)
+    with pytest.raises(DatasetError, match="units: "):
+        read_scenes(write_scene(tmp_path, units="ft"))
+
+
 def test_counts_name_labels_with_one_object(tmp_path: Path) -> None:
     (scene,) = read_scenes(write_scene(tmp_path, counts={"cup": 3}))
     assert [thing.count for thing in scene.objects] == [3, 1]

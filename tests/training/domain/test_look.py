@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+from scene_client.frames import Conventions
 from tests.training.evaluation.scenes import scene as encoded_scene
 from tests.training.scenes import scene
 from training.datasets import generate_rooms
@@ -76,6 +77,34 @@ def test_millimetres_are_found() -> None:
     for axes in (True, False):
         every = [replace(one, viewer_frame=axes) for one in (far, big, near)]
         assert finding("Positions are beyond", *every) == (2, ["far", "big"])
+
+
+ROOM = ("bed", "desk", "chair", "wardrobe")
+SIZES = [(2.0, 1.6, 0.6), (1.4, 0.7, 0.75), (0.5, 0.5, 0.9), (1.2, 0.6, 2.0)]
+PLACES = [(2.0, 1.0, 0.3), (0.0, -1.0, 0.375), (0.0, 0.0, 0.45), (-2.0, 1.0, 1.0)]
+
+
+def test_another_convention_is_found_if_several_scenes_show_it() -> None:
+    """Half extents, in scenes whose declared convention is that of the file."""
+    half = [tuple(side / 2 for side in size) for size in SIZES]
+    right, wrong = (
+        [scene(f"{name}{k}", *ROOM, position=PLACES, size=sizes) for k in range(10)]
+        for name, sizes in (("right", SIZES), ("wrong", half))
+    )
+    words = "another convention"
+    assert finding(words, *wrong) == (10, [f"wrong{k}" for k in range(5)])
+    assert finding(words, *right) == (0, [])
+    assert finding(words, *right, wrong[0]) == (0, [])
+    (advice,) = {one.advice for one in look(wrong).findings if words in one.what}
+    assert "declare `extents` as half" in advice
+    # The sizes of a file with whole sides that declares half of each side are doubled.
+    double = [tuple(side * 2 for side in size) for size in SIZES]
+    declared = replace(
+        scene("declared", *ROOM, position=PLACES, size=double),
+        conventions=Conventions(extents="half"),
+    )
+    (advice,) = {one.advice for one in look([declared]).findings if words in one.what}
+    assert "declare `extents` as full" in advice
 
 
 def test_generated_scenes_contradict_nothing() -> None:

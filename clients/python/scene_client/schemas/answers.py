@@ -108,8 +108,8 @@ class Mapped(Reply):
 
 
 WarningCode = Literal[
-    "implausible-position", "implausible-size", "implausible-scale", "y-axis-up",
-    "rolled-objects", "flat-scene", "unknown-sizes", "not-judged",
+    "convention", "implausible-position", "implausible-size", "flat-scene", "unknown-sizes",
+    "not-judged",
 ]  # fmt: skip
 
 
@@ -117,18 +117,19 @@ class SceneWarning(Reply):
     """A probable mistake in the scene, or a limit of the model. The service still answers."""
 
     code: WarningCode
-    """implausible-position: an object is more than 100 m from the viewer. implausible-size: all
-    sides of an object are below 1 mm, or one is above 20 m. implausible-scale: the sizes of the
-    objects differ from the typical sizes of their classes by a common factor. y-axis-up: the sizes
-    fit only if the y axis points up. rolled-objects: furniture lies on its side, but its size fits
-    an upright object. flat-scene: all objects have the same depth in an optical frame.
-    unknown-sizes: vertical relations of an object are unobserved, because its size is unknown.
-    not-judged: the model has too few training scenes to judge objects or relations, and the list is
-    empty; or too few of them show the class of an object, and the object is no outlier; or the
-    scene lists a single class, and no object is an outlier"""
+    """convention: the boxes probably follow another convention than the scene declares; `declare`
+    names it. implausible-position: an object is more than 100 m from the viewer. implausible-size:
+    all sides of an object are below 1 mm, or one is above 20 m. flat-scene: all objects have the
+    same depth in an optical frame. unknown-sizes: vertical relations of an object are unobserved,
+    because its size is unknown. not-judged: the model has too few training scenes to judge objects
+    or relations, and the list is empty; or too few of them show the class of an object, and the
+    object is no outlier; or the scene lists a single class, and no object is an outlier"""
     message: str
     objects: list[str]
     """ids of the objects that the warning concerns; empty for the whole scene"""
+    declare: dict[str, str] | None = None
+    """for `convention`: the fields of a request that declare the likeliest convention, such as
+    `{"up": "y"}`; empty if no field does"""
 
 
 class Answer(Reply):

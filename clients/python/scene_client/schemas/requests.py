@@ -29,6 +29,8 @@ from pydantic_core import PydanticCustomError
 from pydantic_core.core_schema import CoreSchema, no_info_before_validator_function
 from typing_extensions import Self, TypedDict
 
+from scene_client.frames import BoxOrigin, Extents, QuaternionOrder, Units, Up
+
 MAX_BATCH = 256
 MAX_LABEL = 100
 """Maximum length of a label in characters."""
@@ -61,8 +63,8 @@ def _as_text(value: Any) -> Any:
 
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-Metres = Annotated[float, Field(ge=-1e8, le=1e8, allow_inf_nan=False)]
-Extent = Annotated[float, Field(ge=0, le=1e4, allow_inf_nan=False)]
+Coordinate = Annotated[float, Field(ge=-1e8, le=1e8, allow_inf_nan=False)]
+Extent = Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)]
 Angle = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)]
 Probability = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Label = Annotated[str, Field(min_length=1, max_length=MAX_LABEL), AfterValidator(plain_text)]
@@ -129,15 +131,15 @@ class OrArray:
 
 
 class Position(Request):
-    """A point in metres, in the axes of ``frame_id`` (REP-103: x forward, y left, z up)."""
+    """A point in `units`, in the axes of ``frame_id`` (REP-103: x forward, y left, z up)."""
 
-    x: Metres
-    y: Metres
-    z: Metres
+    x: Coordinate
+    y: Coordinate
+    z: Coordinate
 
 
 class Size(Request):
-    """Extents of a box in metres along its own axes, without the rotation by ``orientation``.
+    """Extents of a box in `units` along its own axes, without the rotation by ``orientation``.
 
     A box may be flat. If all extents are below 1 mm, the size is unknown.
     """
@@ -170,11 +172,13 @@ class Quaternion(Request):
 class Viewpoint(Request):
     """Position of the robot in ``frame_id`` and its viewing direction `yaw` in radians.
 
-    `yaw` is the angle from the x axis towards the y axis.
+    `x` and `y` are in `units`, along the body axes of the frame: x ahead and y left. If the y axis
+    of the frame points up, x is along its -z axis, and y along its -x axis. `yaw` is the angle from
+    x towards y.
     """
 
-    x: Metres
-    y: Metres
+    x: Coordinate
+    y: Coordinate
     yaw: Angle
 
 
@@ -196,13 +200,14 @@ class Detection(Request):
     confidence: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 1.0
     """probability that the object exists"""
     position: Annotated[Position, OrArray()] | None = None
-    """centre of the object's box"""
+    """centre of the object's box, or its `box_origin`"""
     size: Annotated[Size, OrArray()] | None = None
     """default: the typical size of the class, if known"""
     orientation: Annotated[Quaternion, OrArray()] | None = None
     """rotation of the object's box"""
     yaw: Angle | None = None
-    """rotation about the z axis in radians, instead of `orientation`"""
+    """rotation about the z axis in radians, instead of `orientation`; with `up` "y", about the y
+    axis"""
     supported_by: Id | None = None
     """id of the object under this object: the relation on-top. Unused if the service derives
     relations from the positions of all objects"""
@@ -270,6 +275,21 @@ class SceneRequest(Request):
     frame_id: Annotated[str | None, Field(max_length=256)] = None
     """name of the frame of all positions, as in std_msgs/Header. The answer contains the same
     name"""
+    up: Up | None = None
+    """axis of the frame that points up, in all positions, sizes and rotations. Default: z, or -y in
+    a frame whose name ends in `_optical`, which must not declare `up`. With "y", the frame must be
+    right-handed: x right, y up, z towards the viewer"""
+    units: Units = "m"
+    """unit of positions, sizes and the viewpoint. Lengths in answers are in metres"""
+    extents: Extents = "full"
+    """whether a size has the whole sides of a box, or half of each side"""
+    box_origin: BoxOrigin = "centre"
+    """the point of the box at `position`: its centre, the middle of its bottom, or the corner with
+    the smallest x, y and z of the box before its rotation. Without a size, the typical size of the
+    class leads to the centre"""
+    quaternion_order: QuaternionOrder = "xyzw"
+    """order of the numbers of each orientation. With "wxyz", the first number is w, also if it has
+    the name x"""
     stamp: Stamp | None = None
     """time of the scene, as in std_msgs/Header; copied to the answer"""
     viewpoint: Viewpoint | None = None
@@ -318,6 +338,11 @@ class SceneFields(TypedDict, total=False):
     room_type: str
     profile: str
     frame_id: str
+    up: Up
+    units: Units
+    extents: Extents
+    box_origin: BoxOrigin
+    quaternion_order: QuaternionOrder
     stamp: Stamp | Body
     viewpoint: Viewpoint | Body
     model: str

@@ -55,6 +55,7 @@ class Advisor:
         min_score: detections with a lower score are left out.
         unknown_labels: treatment of labels that the model does not know.
         boxes: False if boxes are in pixels; positions are then taken from the hypotheses.
+        conventions: fields that declare the conventions of the boxes, such as ``{"units": "cm"}``.
         own: extra fields for each question, such as ``{"missing": {"top_k": 5}}``.
 
     Raises:
@@ -67,6 +68,7 @@ class Advisor:
     min_score: float = 0.0
     unknown_labels: UnknownLabels = "nearest-or-ignore"
     boxes: bool = True
+    conventions: dict[str, str] = field(default_factory=dict)
     own: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -89,6 +91,7 @@ class Advisor:
             boxes=self.boxes,
             viewpoint=viewpoint,
         )
+        fields.update(self.conventions)
         if not fields["objects"]:
             return Advice(fields, {})
         answers = {}

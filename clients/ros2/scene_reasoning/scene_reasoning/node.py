@@ -25,6 +25,7 @@ from vision_msgs.msg import Detection2DArray, Detection3DArray, LabelInfo
 from visualization_msgs.msg import Marker, MarkerArray
 
 from scene_client import Client, ClientError
+from scene_client.frames import CONVENTIONS
 from scene_client.ros_fields import MessageError
 from scene_reasoning.advisor import Advice, Advisor
 from scene_reasoning.ghosts import Ghost, ghosts
@@ -57,6 +58,9 @@ class SceneNode(Node):
             min_score=self._parameter("min_score", 0.2),
             unknown_labels=self._parameter("unknown_labels", "nearest-or-ignore"),
             boxes=self._parameter("boxes", True),
+            conventions={
+                name: value for name in CONVENTIONS if (value := self._parameter(name, ""))
+            },
         )
         self.latest: Latest[Seen, Advice] = Latest(lambda seen: self.advisor.advise(*seen))
         # The default NaN means that the viewpoint is unknown until the first pose.
