@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from app.compiling import compiled
 from app.inference.elementary import NO_UNIT
 from app.model.scene_model import SceneModel
-from app.model.statistics import UNOBSERVED, add_unseen, rotated_offsets
+from app.model.statistics import UNOBSERVED, add_unseen, offsets_of_missing, rotated
 from app.questions.answer import Fields, best, significant
 from app.questions.posterior import Posterior, exclusive, relation_probability
+from app.questions.spots import move_to_free_spots
 from app.scene.scene import Scene, boxes_of
 from app.scene.spatial_relations import INSIDE, ON_TOP, RELATIONS, SUPPORTS, canonicalise, opposite
 from app.scene.vocabulary import do_not_fit
@@ -111,15 +112,14 @@ def placements(
     )
     offsets: Iterator[Fields | None] = repeat(None)
     if model.offsets is not None and any(thing.position is not None for thing in things):
-        mean, std, scenes = rotated_offsets(
-            model.offsets.tables,
-            relations,
-            candidates[rows],
-            classes[columns],
-            outgoing,
-            _UNTURNED if axes is None else np.array(axes),
-            axes is not None,
+        places = relations, candidates[rows]
+        mean, std, scenes = offsets_of_missing(
+            model.offsets.tables, *places, classes[columns], outgoing, axes is not None
         )
+        move_to_free_spots(
+            model, scene, present, *places, outgoing, objects[columns], mean, std, scenes
+        )
+        mean, std = rotated(mean, std, _UNTURNED if axes is None else np.array(axes))
         offsets = _offset_fields(mean, std, scenes)
     entries: list[list[Fields]] = [[] for _ in candidates]
     arrays = rows.tolist(), relations.tolist(), outgoing.tolist(), columns.tolist()
