@@ -99,10 +99,11 @@ def placements(
     things = [scene.objects[number] for number in objects.tolist()]
     if A > ON_TOP and model.places is not None:
         add_unseen(*model.places.unseen, candidates, classes, forward, backward)
+    sizes = model.vocabulary.sizes
+    has_sizes = any(thing.size is not None for thing in scene.objects)
+    boxes = boxes_of(scene.objects, sizes) if has_sizes else None
     if A > INSIDE:
-        sizes = model.vocabulary.sizes
-        has_sizes = any(thing.size is not None for thing in things)
-        of_things = boxes_of(things, sizes)[1] if has_sizes else sizes[classes]
+        of_things = sizes[classes] if boxes is None else boxes[1][objects]
         candidates_too_large, things_too_large = do_not_fit(sizes[candidates], of_things)
         forward[:, INSIDE][candidates_too_large] = NO_UNIT
         backward[:, INSIDE][things_too_large] = NO_UNIT
@@ -116,9 +117,11 @@ def placements(
         mean, std, scenes = offsets_of_missing(
             model.offsets.tables, *places, classes[columns], outgoing, axes is not None
         )
-        move_to_free_spots(
-            model, scene, present, *places, outgoing, objects[columns], mean, std, scenes
-        )
+        if boxes is not None:
+            anchors = objects[columns]
+            move_to_free_spots(
+                model, scene, present, boxes, *places, outgoing, anchors, mean, std, scenes
+            )
         mean, std = rotated(mean, std, _UNTURNED if axes is None else np.array(axes))
         offsets = _offset_fields(mean, std, scenes)
     entries: list[list[Fields]] = [[] for _ in candidates]

@@ -23,7 +23,7 @@ the free spot nearest to the statistical mean.
 """
 
 import math
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -33,9 +33,9 @@ from app.compiling import compiled
 from app.model.scene_model import SceneModel
 from app.model.statistics import UNOBSERVED
 from app.questions.posterior import Present
-from app.scene.footprints import Pair, measure
+from app.scene.footprints import Pair
 from app.scene.roles import MAX_HEIGHT
-from app.scene.scene import CONTACT, MIN_OFFSET, NEIGHBOUR_GAP, SMALLEST, Scene, boxes_of
+from app.scene.scene import CONTACT, MIN_OFFSET, NEIGHBOUR_GAP, Scene
 from app.scene.spatial_relations import LEFT, ON_TOP, SUPPORTS
 from app.scene.stands import CLEARANCE, FLOOR, HANGS, SUPPORTED, floor_level
 
@@ -50,7 +50,8 @@ _HELD: Final = 0.8  # maximum distance of centres above each other, as a share o
 _COVER: Final = 0.5  # minimum share of a surface that a flat box covers and does not occupy
 _STRETCH: Final = 2.0  # maximum ratio of the free height under an anchor to the typical height
 _CONE: Final = 0.98  # maximum tangent of the angle to the direction of a lateral relation
-_NO_OVERLAP: Final = 1e-3  # maximum overlap of footprints that counts as rounding
+_ROUNDING: Final = 1e-6  # overlap of footprints in metres that counts as a rounding error
+_NUMBERS: Final = 8  # see `_find_obstacles`
 _STEPS: Final = 4  # steps of the grid from the middle of a surface to an edge
 _SIDE: Final = 2 * _STEPS + 1
 _FAR: Final = 9  # steps of the grid away from an anchor
@@ -61,50 +62,17 @@ _UNIFORM: Final = 1 / math.sqrt(3)  # standard deviation of a uniform distributi
 # Roles of a missing object: 2 (relation - ON_TOP), plus 1 if the anchor is the subject.
 _ON, _UNDER, _ABOVE, _BELOW, _IN, _AROUND, _BESIDE = range(7)
 
-
-class Boxes(NamedTuple):
-    """The boxes of the n objects of a scene, in the axes of the viewer. NaN: unknown."""
-
-    centres: Float[NDArray, "n 3"]
-    sizes: Float[NDArray, "n 3"]  # typical sizes for sizes that the request lacks
-    yaws: Float[NDArray, " n"]
-    has_size: Bool[NDArray, " n"]  # whether the request states the size
-    seats: Float[NDArray, " n"]  # `SceneModel.seats`
-    stands: Float[NDArray, "n 3"]  # `Places.stands`
-    holders: Int[NDArray, " n"]  # number of the object on or in which each object is, or -1
-    floor: float  # height of the floor
-
-    @classmethod
-    def of(cls, model: SceneModel, scene: Scene, present: Present) -> "Boxes | None":
-        """Return the boxes of a scene, or None if no object has both a position and a size."""
-        has_size = np.array([
-            thing.position is not None and thing.size is not None and max(thing.size) >= SMALLEST
-            for thing in scene.objects
-        ])  # fmt: skip
-        if model.places is None or not has_size.any():
-            return None
-        centres, sizes = boxes_of(scene.objects, model.vocabulary.sizes)
-        classes = model.vocabulary.stand_in[present.classes][present.row]
-        holders, stands = np.full(len(classes), -1), model.places.stands[classes].astype(float)
-        for a, i, j in scene.triples:
-            if a in SUPPORTS:
-                holders[i] = j
-        return cls(
-            centres,
-            sizes,
-            np.array([thing.yaw for thing in scene.objects]),
-            has_size,
-            model.seats[classes],
-            stands,
-            holders,
-            floor_level(centres[:, 2] - sizes[:, 2] / 2, stands[:, FLOOR]),
-        )
+# Columns of the table of boxes: centre, horizontal extents, cos and sin of the yaw, heights of
+# bottom, top, surface and floor, usual stand, and number of the holder or -1. NaN: unknown.
+_COLUMNS: Final = 13
+_X, _Y, _Z, _SIZE_X, _SIZE_Y, _COS, _SIN, _LOW, _HIGH, _SURFACE, _FLOOR, _STAND, _HOLDER = range(13)
 
 
 def move_to_free_spots(
     model: SceneModel,
     scene: Scene,
     present: Present,
+    boxes: tuple[Float[NDArray, "N 3"], Float[NDArray, "N 3"]],  # see `boxes_of`
     relation: Int[NDArray, " n"],
     missing: Int[NDArray, " n"],  # classes
     outgoing: Bool[NDArray, " n"],  # whether the missing object is the relation's subject
@@ -119,15 +87,57 @@ def move_to_free_spots(
     the missing object is unknown. For stacked relations, the horizontal standard deviation is at
     most that of a uniform distribution over the possible centres.
     """
-    boxes = Boxes.of(model, scene, present)
-    if boxes is not None and model.places is not None:
-        sizes, stands = model.vocabulary.sizes[missing], model.places.stands[missing]
-        _move(boxes, relation, outgoing, anchor, sizes, stands, mean, std, scenes)
+    if model.places is None:
+        return
+    classes = model.vocabulary.stand_in[present.classes][present.row]
+    holders = np.full(len(classes), -1)
+    for a, i, j in scene.triples:
+        if a in SUPPORTS:
+            holders[i] = j
+    yaws, has_size = np.array([(thing.yaw, thing.size is not None) for thing in scene.objects]).T
+    stands = model.places.stands
+    table = _table(*boxes, yaws, model.seats[classes], stands[classes], holders)
+    sizes = model.vocabulary.sizes[missing]
+    places = relation, outgoing, anchor, sizes, stands[missing]
+    _move(table, has_size, *places, mean, std, scenes)
+
+
+@compiled
+def _table(
+    centres: Float[NDArray, "n 3"],
+    sizes: Float[NDArray, "n 3"],
+    yaws: Float[NDArray, " n"],
+    seats: Float[NDArray, " n"],  # `SceneModel.seats`
+    stands: Float[NDArray, "n 3"],  # `Places.stands`
+    holders: Int[NDArray, " n"],  # number of the object on or in which each object is, or -1
+) -> Float[NDArray, "n columns"]:
+    """Return the table of the boxes of a scene. NaN: unknown."""
+    boxes = np.empty((len(yaws), _COLUMNS))
+    for i in range(len(yaws)):
+        half = sizes[i, 2] / 2
+        boxes[i, _X], boxes[i, _Y], boxes[i, _Z] = centres[i]
+        boxes[i, _SIZE_X], boxes[i, _SIZE_Y] = sizes[i, :2]
+        boxes[i, _COS], boxes[i, _SIN] = math.cos(yaws[i]), math.sin(yaws[i])
+        boxes[i, _LOW], boxes[i, _HIGH] = centres[i, 2] - half, centres[i, 2] + half
+        seat, boxes[i, _STAND] = boxes[i, _LOW] + seats[i], stands[i].argmax()
+        boxes[i, _SURFACE] = seat if seat <= boxes[i, _HIGH] - _BACK else boxes[i, _HIGH]
+    floor = floor_level(boxes[:, _LOW], stands[:, FLOOR])
+    for i in range(len(yaws)):
+        low, stand, j = boxes[i, _LOW], boxes[i, _STAND], holders[i]
+        # The bottom of a box on the floor is the best estimate near this box.
+        is_on_floor = low <= floor + CLEARANCE and stand != HANGS
+        if math.isnan(floor):
+            is_on_floor = stand == FLOOR
+        boxes[i, _FLOOR] = low if is_on_floor else floor
+        # A rug holds no box, nor does a bin under a desk, although the desk is "on top of" the bin.
+        boxes[i, _HOLDER] = j if j >= 0 and low >= boxes[j, _LOW] + CLEARANCE else -1
+    return boxes
 
 
 @compiled
 def _move(
-    boxes: Boxes,
+    boxes: Float[NDArray, "N columns"],
+    has_size: Float[NDArray, " N"],  # 1 if the request states the size, and 0 otherwise
     relation: Int[NDArray, " n"],
     outgoing: Bool[NDArray, " n"],
     anchor: Int[NDArray, " n"],
@@ -140,23 +150,25 @@ def _move(
     """Move means and limit standard deviations, in place; see `move_to_free_spots`."""
     for k in range(len(relation)):
         i, size = anchor[k], (sizes[k, 0], sizes[k, 1], sizes[k, 2])
-        if scenes[k] == UNOBSERVED or not boxes.has_size[i] or math.isnan(sum(size)):
+        known = boxes[i, _Z] + sum(size)  # NaN: a position or a size is unknown
+        if scenes[k] == UNOBSERVED or not has_size[i] or math.isnan(known):
             continue
         role, direction = _BESIDE, _direction(relation[k], outgoing[k])
         if relation[k] >= ON_TOP:
             role = 2 * (relation[k] - ON_TOP) + (0 if outgoing[k] else 1)
-        learned = boxes.centres[i, 2] + mean[k, 2] - size[2] / 2
+        learned = boxes[i, _Z] + mean[k, 2] - size[2] / 2
         reach = learned + _REACH * std[k, 2]
         heights = _heights(boxes, i, role, size[2], stands[k], learned, reach)
         limits = _limits(boxes, i, role, size, direction)
-        cos, sin = abs(math.cos(boxes.yaws[i])), abs(math.sin(boxes.yaws[i]))
         if role != _BESIDE:
+            cos, sin = abs(boxes[i, _COS]), abs(boxes[i, _SIN])
             std[k, 0] = min(std[k, 0], _UNIFORM * (cos * limits[0] + sin * limits[1]))
             std[k, 1] = min(std[k, 1], _UNIFORM * (sin * limits[0] + cos * limits[1]))
         spot = _nearest_spot(boxes, i, role, size, heights, limits, direction, mean[k])
         if math.isnan(spot[2]):
             scenes[k] = UNOBSERVED
-        mean[k, 0], mean[k, 1], mean[k, 2] = spot
+        else:
+            mean[k, 0], mean[k, 1], mean[k, 2] = spot
 
 
 @compiled
@@ -171,7 +183,7 @@ def _direction(relation: int, outgoing: bool) -> Pair:
 
 @compiled
 def _heights(
-    boxes: Boxes,
+    boxes: Float[NDArray, "N columns"],
     i: int,  # the anchor
     role: int,
     height: float,
@@ -184,13 +196,17 @@ def _heights(
     If the limit is not NaN, the object stands on the highest surface below this limit. Without such
     a surface, it stands at the bottom, which is then the floor or NaN.
     """
-    low = _bottom(boxes, i)
-    high, usual, of_anchor = low + boxes.sizes[i, 2], stands.argmax(), boxes.stands[i].argmax()
-    ground, bottom, limit = _ground(boxes, i), math.nan, math.nan
+    low, high, ground, of_anchor = (
+        boxes[i, _LOW],
+        boxes[i, _HIGH],
+        boxes[i, _FLOOR],
+        boxes[i, _STAND],
+    )
+    usual, bottom, limit = stands.argmax(), math.nan, math.nan
     on_floor = ground if stands[FLOOR] >= _OFTEN else math.nan
-    is_raised = _holder(boxes, i) >= 0 or (of_anchor == SUPPORTED and low != ground)
+    is_raised = boxes[i, _HOLDER] >= 0 or (of_anchor == SUPPORTED and low != ground)
     if role == _ON:
-        bottom = surface_of(boxes, i)
+        bottom = boxes[i, _SURFACE]
     elif role == _IN:
         bottom = min(max(learned, low), max(low, high - height))
     elif role == _UNDER and of_anchor != HANGS:
@@ -243,50 +259,19 @@ def _under(
     return bottom, top, math.nan
 
 
-@compiled
-def surface_of(boxes: Boxes, i: int) -> float:
-    """Return the height of the seat of a box below its back, or of its top face."""
-    seat, top = _bottom(boxes, i) + boxes.seats[i], boxes.centres[i, 2] + boxes.sizes[i, 2] / 2
-    return seat if seat <= top - _BACK else top
-
-
-@compiled
-def _bottom(boxes: Boxes, i: int) -> float:
-    return boxes.centres[i, 2] - boxes.sizes[i, 2] / 2
-
-
-@compiled
-def _ground(boxes: Boxes, i: int) -> float:
-    """Return the height of the floor: the bottom of a box on the floor, or NaN if unknown."""
-    low, usual = _bottom(boxes, i), boxes.stands[i].argmax()
-    if math.isnan(boxes.floor):
-        return low if usual == FLOOR else math.nan
-    return low if usual != HANGS and low <= boxes.floor + CLEARANCE else boxes.floor
-
-
-@compiled
-def _holder(boxes: Boxes, i: int) -> int:
-    """Return the box that holds a box well above its own bottom, or -1.
-
-    A rug holds no box, nor does a bin under a desk, although the desk is "on top of" the bin.
-    """
-    j = boxes.holders[i]
-    if j < 0:
-        return -1
-    return j if _bottom(boxes, i) >= _bottom(boxes, j) + CLEARANCE else -1
-
-
 # ------------------------------------------------------------------------------------------- spots
 
 
 @compiled
-def _limits(boxes: Boxes, i: int, role: int, size: Triple, direction: Pair) -> Pair:
+def _limits(
+    boxes: Float[NDArray, "N columns"], i: int, role: int, size: Triple, direction: Pair
+) -> Pair:
     """Return the maximum distances of the centres in the axes of the anchor.
 
     Beside the anchor, these are the distances along and across the direction at which both boxes
     touch.
     """
-    x, y = boxes.sizes[i, 0], boxes.sizes[i, 1]
+    x, y = boxes[i, _SIZE_X], boxes[i, _SIZE_Y]
     if role in (_ON, _IN):
         return max(x - size[0], 0.0) / 2, max(y - size[1], 0.0) / 2
     if role == _AROUND:
@@ -295,20 +280,20 @@ def _limits(boxes: Boxes, i: int, role: int, size: Triple, direction: Pair) -> P
         return abs(x - size[0]) / 2, abs(y - size[1]) / 2
     if role != _BESIDE:
         return _HELD * max(x, size[0]) / 2, _HELD * max(y, size[1]) / 2
-    x, y = _extents(x + size[0], y + size[1], boxes.yaws[i])
+    x, y = _extents(x + size[0], y + size[1], boxes[i, _COS], boxes[i, _SIN])
     return (x / 2, y / 2) if direction[0] else (y / 2, x / 2)
 
 
 @compiled
-def _extents(x: float, y: float, yaw: float) -> Pair:
-    """Return the extents of a rotated footprint along the axes."""
-    cos, sin = abs(math.cos(yaw)), abs(math.sin(yaw))
+def _extents(x: float, y: float, cos: float, sin: float) -> Pair:
+    """Return the extents along the axes of a footprint with this cos and sin of the yaw."""
+    cos, sin = abs(cos), abs(sin)
     return cos * x + sin * y, sin * x + cos * y
 
 
 @compiled
 def _nearest_spot(
-    boxes: Boxes,
+    boxes: Float[NDArray, "N columns"],
     i: int,
     role: int,
     size: Triple,
@@ -320,39 +305,39 @@ def _nearest_spot(
     """Return the offset of the free spot nearest to a mean, or NaN without a free spot."""
     nearest, spot = math.inf, (math.nan, math.nan, math.nan)
     bottom, top, limit = heights
-    holder = _holder(boxes, i)
-    holds = (
-        role == _BESIDE and holder >= 0 and bottom == boxes.centres[i, 2] - boxes.sizes[i, 2] / 2
-    )
+    holder, turn = int(boxes[i, _HOLDER]), (boxes[i, _COS], boxes[i, _SIN])
+    is_held = role == _BESIDE and holder >= 0 and bottom == boxes[i, _LOW]
+    base = i if role == _ON else holder if is_held else -1
+    obstacles, count, base_of_obstacles = np.empty((len(boxes), _NUMBERS)), 0, -2
     for number in range(-1, (_FAR + 1) * _WIDTH if role == _BESIDE else _SIDE**2):
         if role == _BESIDE:
             x, y = _beside(number, limits, direction, mean)
         else:
-            x, y = _over(number, limits, boxes.yaws[i], mean)
+            x, y = _over(number, limits, turn, mean)
         distance = math.hypot(x - mean[0], y - mean[1])
         if not distance < nearest:
             continue
-        point, base = (boxes.centres[i, 0] + x, boxes.centres[i, 1] + y), -1
-        if holds:
-            base = holder
-            if not _fits_on(boxes, base, point, size, boxes.yaws[i]):
-                continue
-        elif role == _ON:
-            base = i
-        elif not math.isnan(limit):
-            bottom, base = heights[0], _carrier(boxes, i, point, size, limit)
-            if base >= 0:
-                bottom = surface_of(boxes, base)
+        point = (boxes[i, _X] + x, boxes[i, _Y] + y)
+        if is_held and not _fits_on(boxes, base, point, size, turn):
+            continue
+        if not math.isnan(limit):
+            base = _carrier(boxes, point, size, turn, limit)
+            bottom = heights[0] if base < 0 else boxes[base, _SURFACE]
             top = bottom + size[2]
-        if bottom <= top and _is_free(boxes, i, role, point, size, bottom, top, base):
-            nearest, spot = distance, (x, y, (bottom + top) / 2 - boxes.centres[i, 2])
+        if not bottom <= top:
+            continue
+        if base != base_of_obstacles:
+            count = _find_obstacles(boxes, i, role, size, bottom, top, base, obstacles)
+            base_of_obstacles = base
+        if _is_free(obstacles[:count], point, turn):
+            nearest, spot = distance, (x, y, (bottom + top) / 2 - boxes[i, _Z])
     return spot
 
 
 @compiled
-def _over(number: int, limits: Pair, yaw: float, mean: Float[NDArray, " 3"]) -> Pair:
+def _over(number: int, limits: Pair, turn: Pair, mean: Float[NDArray, " 3"]) -> Pair:
     """Return the offset of a spot over, in or under an anchor; -1 is nearest to the mean."""
-    cos, sin = math.cos(yaw), math.sin(yaw)
+    cos, sin = turn  # of the yaw of the anchor
     p = (number // _SIDE - _STEPS) / _STEPS * limits[0]
     q = (number % _SIDE - _STEPS) / _STEPS * limits[1]
     if number < 0:
@@ -377,61 +362,97 @@ def _beside(number: int, limits: Pair, direction: Pair, mean: Float[NDArray, " 3
 
 
 @compiled
-def _fits_on(boxes: Boxes, k: int, point: Pair, size: Triple, yaw: float) -> bool:
+def _fits_on(
+    boxes: Float[NDArray, "N columns"], k: int, point: Pair, size: Triple, turn: Pair
+) -> bool:
     """Return whether a footprint at a point is on the footprint of box k, without overhang."""
-    dx, dy = point[0] - boxes.centres[k, 0], point[1] - boxes.centres[k, 1]
-    cos, sin = math.cos(boxes.yaws[k]), math.sin(boxes.yaws[k])
-    x, y = _extents(size[0], size[1], yaw - boxes.yaws[k])
-    fits_x = abs(cos * dx + sin * dy) + x / 2 <= boxes.sizes[k, 0] / 2
-    return fits_x and abs(cos * dy - sin * dx) + y / 2 <= boxes.sizes[k, 1] / 2
+    dx, dy, cos, sin = (
+        point[0] - boxes[k, _X],
+        point[1] - boxes[k, _Y],
+        boxes[k, _COS],
+        boxes[k, _SIN],
+    )
+    x, y = _extents(size[0], size[1], *_difference(turn, (cos, sin)))
+    fits_x = abs(cos * dx + sin * dy) + x / 2 <= boxes[k, _SIZE_X] / 2
+    return fits_x and abs(cos * dy - sin * dx) + y / 2 <= boxes[k, _SIZE_Y] / 2
 
 
 @compiled
-def _carrier(boxes: Boxes, i: int, point: Pair, size: Triple, limit: float) -> int:
+def _difference(turn: Pair, other: Pair) -> Pair:
+    """Return cos and sin of the difference of two angles with these values of cos and sin."""
+    return turn[0] * other[0] + turn[1] * other[1], turn[1] * other[0] - turn[0] * other[1]
+
+
+@compiled
+def _carrier(
+    boxes: Float[NDArray, "N columns"], point: Pair, size: Triple, turn: Pair, limit: float
+) -> int:
     """Return the box with the highest surface below a limit on which a footprint fits, or -1."""
-    found, highest = -1, boxes.floor + CLEARANCE if boxes.floor > -math.inf else -math.inf
-    for k in range(len(boxes.yaws)):
-        surface = surface_of(boxes, k)
-        if highest < surface <= limit and _fits_on(boxes, k, point, size, boxes.yaws[i]):
-            found, highest = k, surface
-    return found
+    carrier, highest = -1, -math.inf
+    for k in range(len(boxes)):
+        surface = boxes[k, _SURFACE]
+        is_floor = surface <= boxes[k, _FLOOR] + CLEARANCE
+        if highest < surface <= limit and not is_floor and _fits_on(boxes, k, point, size, turn):
+            carrier, highest = k, surface
+    return carrier
 
 
 @compiled
-def _is_free(
-    boxes: Boxes,
+def _find_obstacles(
+    boxes: Float[NDArray, "N columns"],
     i: int,
     role: int,
-    point: Pair,
     size: Triple,
     bottom: float,
     top: float,
     base: int,  # the box with the surface of the spot, or -1 on the floor
-) -> bool:
-    """Return whether no box is at the spot, but those that hold or surround the anchor."""
-    area, yaw = size[0] * size[1], boxes.yaws[i]
-    holder = _holder(boxes, i) if role in (_ON, _IN, _ABOVE) else -1
-    surface = area / _COVER if base < 0 else boxes.sizes[base, 0] * boxes.sizes[base, 1]
-    radius = math.hypot(size[0], size[1]) / 2
-    for k in range(len(boxes.yaws)):
-        centre, extents = boxes.centres[k], boxes.sizes[k]
-        low, high = centre[2] - extents[2] / 2, centre[2] + extents[2] / 2
+    obstacles: Float[NDArray, "n 8"],  # receives the results
+) -> int:
+    """Find the boxes at the height of a spot, but those that hold or surround the anchor.
+
+    Each result has the centre of a box, cos and sin of its yaw, and the distances at which the box
+    and the missing object touch, along the axes of the box and of the object.
+    """
+    area, count = size[0] * size[1], 0
+    holder = int(boxes[i, _HOLDER]) if role in (_ON, _IN, _ABOVE) else -1
+    surface = area / _COVER if base < 0 else boxes[base, _SIZE_X] * boxes[base, _SIZE_Y]
+    for k in range(len(boxes)):
+        low, high, x, y = boxes[k, _LOW], boxes[k, _HIGH], boxes[k, _SIZE_X], boxes[k, _SIZE_Y]
+        other = x * y
         overlap = min(top, high) - max(bottom, low)
         if not overlap > min(_TOUCH, min(top - bottom, high - low) / 2):
             continue
-        distance = math.hypot(point[0] - centre[0], point[1] - centre[1])
-        if not distance < radius + math.hypot(extents[0], extents[1]) / 2:
-            continue
-        # Objects stand on a rug or a tablecloth.
-        other = extents[0] * extents[1]
-        is_cover = extents[2] <= CONTACT and other >= _COVER * surface
+        # Objects stand on a rug or a tablecloth, and a container can hold several objects.
+        is_cover = high - low <= CONTACT and other >= _COVER * surface
         covers = top - bottom <= CONTACT and area >= max(other, _COVER * surface)
-        if is_cover or covers or k in (base, holder) or (k == i and role != _BESIDE):
+        is_inside = low >= bottom - _TOUCH and high <= top + _TOUCH and other <= area
+        if is_cover or covers or (is_inside and role == _AROUND):
             continue
-        if measure(point, size, yaw, centre, extents, boxes.yaws[k])[0] <= _NO_OVERLAP:
-            continue
-        # A missing container can also hold other objects.
-        is_held = low >= bottom - _TOUCH and high <= top + _TOUCH
-        if not (role == _AROUND and is_held and other <= area):
+        if k not in (base, holder) and (k != i or role == _BESIDE):
+            row, turn = obstacles[count], (boxes[k, _COS], boxes[k, _SIN])
+            cos, sin = _difference(turn, (boxes[i, _COS], boxes[i, _SIN]))
+            width, depth = _extents(size[0], size[1], cos, sin)
+            own_width, own_depth = _extents(x, y, cos, sin)
+            row[0], row[1], row[2], row[3] = boxes[k, _X], boxes[k, _Y], turn[0], turn[1]
+            row[4], row[5] = (x + width) / 2 - _ROUNDING, (y + depth) / 2 - _ROUNDING
+            row[6] = (size[0] + own_width) / 2 - _ROUNDING
+            row[7] = (size[1] + own_depth) / 2 - _ROUNDING
+            count += 1
+    return count
+
+
+@compiled
+def _is_free(obstacles: Float[NDArray, "m 8"], point: Pair, turn: Pair) -> bool:
+    """Return whether a footprint overlaps no obstacle.
+
+    Two rectangles overlap if and only if their projections on each of their four sides overlap.
+    """
+    for k in range(len(obstacles)):
+        x, y, cos, sin, reach_x, reach_y, own_x, own_y = obstacles[k]
+        dx, dy = point[0] - x, point[1] - y
+        meets = abs(cos * dx + sin * dy) < reach_x and abs(cos * dy - sin * dx) < reach_y
+        cos, sin = turn
+        meets = meets and abs(cos * dx + sin * dy) < own_x
+        if meets and abs(cos * dy - sin * dx) < own_y:
             return False
     return True

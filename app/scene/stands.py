@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
+from app.compiling import compiled
 from app.scene.scene import CONTACT
 from app.scene.spatial_relations import ABOVE, INSIDE, ON_TOP
 
@@ -23,19 +24,26 @@ CLOSE: Final = 0.15  # maximum gap in metres to an object that may support an ob
 USUAL: Final = 0.5  # share of a stand that is usual for a class
 
 
+@compiled
 def floor_level(bottoms: Float[NDArray, " n"], weights: Float[NDArray, " n"]) -> float:
     """Return the height of the floor in metres: the lower weighted tertile of bottoms of boxes.
 
     The weights are the shares of the objects of each class that stand on the floor. Boxes with a
     weight below `USUAL` do not count. If all boxes have such a weight, the height is NaN.
     """
-    usable = np.isfinite(bottoms) & (weights >= USUAL)
-    bottoms, weights = bottoms[usable], weights[usable]
-    if not len(bottoms):
-        return math.nan
-    order = bottoms.argsort(kind="stable")
-    total = weights[order].cumsum()
-    return float(bottoms[order[total.searchsorted(total[-1] / 3)]])
+    total, floor = 0.0, np.inf
+    for i in range(len(bottoms)):
+        if np.isfinite(bottoms[i]) and weights[i] >= USUAL:
+            total += weights[i]
+    for i in range(len(bottoms)):
+        if bottoms[i] < floor and weights[i] >= USUAL:
+            lower = 0.0  # weight of the boxes that are not higher than box i
+            for j in range(len(bottoms)):
+                if bottoms[j] <= bottoms[i] and weights[j] >= USUAL:
+                    lower += weights[j]
+            if lower >= total / 3:
+                floor = bottoms[i]
+    return floor if total > 0 else math.nan
 
 
 @dataclass(frozen=True)
