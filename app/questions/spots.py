@@ -213,8 +213,8 @@ def _heights(
         return _under(low, high, height, ground, usual == FLOOR, of_anchor == FLOOR)
     elif role == _AROUND:
         bottom = low if usual == SUPPORTED else min(learned, low)
-        if usual == FLOOR and ground <= low + _TOUCH:
-            bottom = ground
+        if ground <= low + _TOUCH:
+            bottom = ground if usual == FLOOR else max(bottom, ground)
         if bottom + MAX_HEIGHT * height < high:
             bottom = math.nan
     elif role == _ABOVE:
@@ -414,7 +414,7 @@ def _find_obstacles(
     and the missing object touch, along the axes of the box and of the object.
     """
     area, count = size[0] * size[1], 0
-    holder = int(boxes[i, _HOLDER]) if role in (_ON, _IN, _ABOVE) else -1
+    holder = int(boxes[i, _HOLDER]) if role in (_ON, _IN) else -1
     surface = area / _COVER if base < 0 else boxes[base, _SIZE_X] * boxes[base, _SIZE_Y]
     for k in range(len(boxes)):
         low, high, x, y = boxes[k, _LOW], boxes[k, _HIGH], boxes[k, _SIZE_X], boxes[k, _SIZE_Y]
