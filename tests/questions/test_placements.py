@@ -15,7 +15,7 @@ from scipy.special import expit, logit
 
 from app.model import CountSlope, Offsets
 from app.model.calibration import PlaceFit
-from app.model.statistics import UNOBSERVED, rotated_offsets
+from app.model.statistics import UNOBSERVED, offsets_of_missing, rotated
 from app.questions.placements import Place, place_log_p, placements
 from app.questions.posterior import Posterior
 from app.scene import RELATIONS, ObjectClass, Scene, SceneObject, Vocabulary
@@ -110,8 +110,8 @@ VIEWER = viewer_axes()
 
 def offset_of(relation, missing, anchor, outgoing=True, axes=VIEWER, offsets=OFFSETS):
     ends = (np.array([value]) for value in (relation, missing, anchor, outgoing))
-    rotation = np.eye(3) if axes is None else np.array(axes)
-    values = rotated_offsets(offsets.tables, *ends, rotation, axes is not None)
+    mean, std, scenes = offsets_of_missing(offsets.tables, *ends, axes is not None)
+    values = *rotated(mean, std, np.eye(3) if axes is None else np.array(axes)), scenes
     mean, std, scenes = (value[0].tolist() for value in values)
     return None if scenes == UNOBSERVED else Offset(tuple(mean), tuple(std), scenes)
 
