@@ -261,6 +261,8 @@ def test_an_object_that_never_stands_on_the_floor_needs_a_surface():
     """Left of the chair, the vase stands on the desk, if there is one."""
     chair, desk = box("chair", 1, 0), box("desk", 1, 1.2)
     assert spot_of(scene_of(chair), "left", VASE, 0, (0.0, 1.0, 0.3)) is None
+    on_rug = scene_of(chair, box("rug", 1, 0, size=(4.0, 4.0, 0.01)))
+    assert spot_of(on_rug, "left", VASE, 0, (0.0, 1.0, 0.3)) is None
     vase, _ = spot_of(scene_of(chair, desk), "left", VASE, 0, (0.0, 1.0, 0.4))
     assert vase[2] == pytest.approx(0.75 + 0.15 - 0.45)
     assert vase[1] >= 0.5 + 0.1
@@ -284,6 +286,17 @@ def test_hanging_objects_keep_the_height_of_the_statistics():
     low, _ = spot_of(scene, "above", VASE, 0, (0.0, 0.1, 0.2), model=model)
     assert low[2] - 0.15 > 0.4 + 0.05
     assert spot_of(scene, "above", LAMP, 0, (0.0, 0.1, 1.4)) is None
+
+
+def test_objects_below_have_space():
+    """The bottom of the lamp is 1 m or 0.8 m above the floor, and the desk is 0.75 m high."""
+    lamps = {gap: scene_of(box("lamp", 1, 0, gap), box("bed", 4, 4)) for gap in (1.0, 0.8)}
+    below, _ = spot_of(lamps[1.0], "below", DESK, 0)
+    assert below[2] == pytest.approx(0.375 - 1.2)
+    assert spot_of(lamps[0.8], "below", DESK, 0) is None
+    table = scene_of(box("lamp", 1, 0, 1.5), box("desk", 1, 0), box("bed", 4, 4))
+    vase, _ = spot_of(table, "below", VASE, 0)
+    assert vase[2] == pytest.approx(0.75 + 0.15 - 1.7)
 
 
 def test_boxes_without_a_stated_size_keep_the_statistics():
