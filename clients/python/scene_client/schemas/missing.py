@@ -70,6 +70,13 @@ class Offset:
     standard deviations in the plane, or within 2.15 in space. `scenes` is the number of training
     scenes with this relation between the two classes. If `scenes` is 0, the offset is estimated
     from the relation and from each class separately.
+
+    If the request states the size of `object`, `mean` is a free spot for an object of the typical
+    size. There it touches the top face of `object` (on-top; the seat of a bed, a sofa or a chair),
+    is within its box (inside), or stands on the floor or on a box. Objects that usually hang keep
+    the usual height. The object has the yaw of `object`, and overlaps no other box. For on-top,
+    inside, under, above and their opposites, `std` is at most what the surface leaves to the
+    centre. Furniture under an object that stands on a surface reaches from the floor to this object.
     """
 
     mean: Vector
@@ -86,7 +93,9 @@ class Placement(Reply):
     offset: Offset | None = None
     """offset from `object` in metres. The offset is absent if `object` has no position, or if the
     training scenes have no poses. It is also absent for left, right, front and behind in a map,
-    odom or world frame without a viewpoint"""
+    odom or world frame without a viewpoint. If the request states the size of `object` and no spot
+    is free, the offset is absent too. Then the place is as probable, but an arm has no room there:
+    take the next place with an offset"""
 
 
 class MissingObject(Reply):
