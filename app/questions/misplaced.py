@@ -183,7 +183,7 @@ def _stands(
     classes = listed[present.row]
     stand_shares = places.stands[classes].astype(np.float64)
     if heights is not None and scene.relations is not None:
-        floor = floor_level(heights.bottoms, stand_shares[:, FLOOR])
+        floor = floor_level(heights.bottoms, stand_shares[:, FLOOR].copy())
         stands = stands_of(*scene.relations.grids(len(classes)), heights, floor)
     else:
         stands[[i for i, _ in supports]] = SUPPORTED

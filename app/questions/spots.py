@@ -94,7 +94,8 @@ def move_to_free_spots(
     for a, i, j in scene.triples:
         if a in SUPPORTS:
             holders[i] = j
-    yaws, has_size = np.array([(thing.yaw, thing.size is not None) for thing in scene.objects]).T
+    yaws = np.array([thing.yaw for thing in scene.objects])
+    has_size = np.array([thing.size is not None for thing in scene.objects])
     stands = model.places.stands
     table = _table(*boxes, yaws, model.seats[classes], stands[classes], holders)
     sizes = model.vocabulary.sizes[missing]
@@ -137,7 +138,7 @@ def _table(
 @compiled
 def _move(
     boxes: Float[NDArray, "N columns"],
-    has_size: Float[NDArray, " N"],  # 1 if the request states the size, and 0 otherwise
+    has_size: Bool[NDArray, " N"],  # whether the request states the size
     relation: Int[NDArray, " n"],
     outgoing: Bool[NDArray, " n"],
     anchor: Int[NDArray, " n"],

@@ -71,12 +71,12 @@ class Offset:
     scenes with this relation between the two classes. If `scenes` is 0, the offset is estimated
     from the relation and from each class separately.
 
-    If the request states the size of `object`, `mean` is a free spot for an object of the typical
-    size. There it touches the top face of `object` (on-top; the seat of a bed, a sofa or a chair),
-    is within its box (inside), or stands on the floor or on a box. Objects that usually hang keep
-    the usual height. The object has the yaw of `object`, and overlaps no other box. For on-top,
-    inside, under, above and their opposites, `std` is at most what the surface leaves to the
-    centre. Furniture under an object that stands on a surface reaches from the floor to this object.
+    If the request states the size of `object`, `mean` is a free spot for a missing object of the
+    typical size, with the yaw of `object`. It overlaps no other box. On top, it touches the top
+    face of `object`, or the seat of a bed, a sofa or a chair. Inside, it is between bottom and top
+    of `object`. Otherwise it stands on the floor or on a box, or hangs at the usual height. Below
+    an object that it supports, it reaches from the floor to this object. For on-top, inside, above
+    and their opposites, `std` is at most what the surface leaves to the centre.
     """
 
     mean: Vector
