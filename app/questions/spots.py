@@ -50,7 +50,7 @@ _HELD: Final = 0.8  # maximum distance of centres above each other, as a share o
 _COVER: Final = 0.5  # minimum share of a surface that a flat box covers and does not occupy
 _STRETCH: Final = 2.0  # maximum ratio of the free height under an anchor to the typical height
 _CONE: Final = 0.98  # maximum tangent of the angle to the direction of a lateral relation
-_ROUNDING: Final = 1e-6  # overlap of footprints in metres that counts as a rounding error
+_MARGIN: Final = 0.01  # minimum gap in metres to other boxes
 _NUMBERS: Final = 8  # see `_find_obstacles`
 _STEPS: Final = 4  # steps of the grid from the middle of a surface to an edge
 _SIDE: Final = 2 * _STEPS + 1
@@ -203,45 +203,67 @@ def _heights(
         boxes[i, _FLOOR],
         boxes[i, _STAND],
     )
-    usual, bottom, limit = stands.argmax(), math.nan, math.nan
-    on_floor = ground if stands[FLOOR] >= _OFTEN else math.nan
-    is_raised = boxes[i, _HOLDER] >= 0 or (of_anchor == SUPPORTED and low != ground)
+    usual, bottom = stands.argmax(), math.nan
+    if role == _BESIDE:
+        return _heights_beside(boxes, i, height, stands, learned, reach)
+    if role == _BELOW or (role == _UNDER and of_anchor == HANGS):
+        return _heights_below(low - CONTACT - _GAP - height, height, ground, stands, learned)
+    if role == _UNDER:
+        return _heights_under(low, high, height, ground, usual == FLOOR, of_anchor == FLOOR)
     if role == _ON:
         bottom = boxes[i, _SURFACE]
     elif role == _IN:
         bottom = min(max(learned, low), max(low, high - height))
-    elif role == _UNDER and of_anchor != HANGS:
-        return _under(low, high, height, ground, usual == FLOOR, of_anchor == FLOOR)
     elif role == _AROUND:
         bottom = low if usual == SUPPORTED else min(learned, low)
         if ground <= low + _TOUCH:
             bottom = ground if usual == FLOOR else max(bottom, ground)
         if bottom + MAX_HEIGHT * height < high:
             bottom = math.nan
-    elif role == _ABOVE:
-        if usual == HANGS:
-            bottom = max(learned, high + CONTACT + _GAP)
-    elif role in (_BELOW, _UNDER):
-        highest = low - CONTACT - _GAP - height
-        if usual == HANGS:
-            bottom = min(learned, highest)
-        else:
-            bottom, limit = on_floor, (math.nan if usual == FLOOR else highest)
-        if bottom > highest or bottom < ground:
-            bottom = math.nan
-    elif usual == HANGS:
-        bottom = learned if math.isnan(ground) else max(learned, ground)
+    elif usual == HANGS:  # above the anchor
+        bottom = max(learned, high + CONTACT + _GAP)
+    return bottom, bottom + height, math.nan
+
+
+@compiled
+def _heights_beside(
+    boxes: Float[NDArray, "N columns"],
+    i: int,
+    height: float,
+    stands: Float[NDArray, " 3"],
+    learned: float,
+    reach: float,
+) -> Triple:
+    """Return the heights of an object beside an anchor; see `_heights`."""
+    low, ground, usual, limit = boxes[i, _LOW], boxes[i, _FLOOR], stands.argmax(), math.nan
+    is_raised = boxes[i, _HOLDER] >= 0 or (boxes[i, _STAND] == SUPPORTED and low != ground)
+    if usual == HANGS:
+        bottom = ground if learned <= ground + CLEARANCE else learned
     elif is_raised and stands[SUPPORTED] >= _OFTEN:
         bottom = low
     elif usual == FLOOR:
         bottom = learned if math.isnan(ground) else ground
     else:
-        bottom, limit = on_floor, reach
+        bottom, limit = ground if stands[FLOOR] >= _OFTEN else math.nan, reach
     return bottom, bottom + height, limit
 
 
 @compiled
-def _under(
+def _heights_below(
+    highest: float, height: float, ground: float, stands: Float[NDArray, " 3"], learned: float
+) -> Triple:
+    """Return the heights of an object with its bottom at most at `highest`; see `_heights`."""
+    bottom, usual = ground if stands[FLOOR] >= _OFTEN else math.nan, stands.argmax()
+    limit = highest if usual == SUPPORTED else math.nan
+    if usual == HANGS:
+        bottom = min(learned, highest)
+    if bottom > highest or bottom < ground:
+        bottom = math.nan
+    return bottom, bottom + height, limit
+
+
+@compiled
+def _heights_under(
     low: float, high: float, height: float, ground: float, is_furniture: bool, has_legs: bool
 ) -> Triple:
     """Return the heights between the legs of an anchor, or of a support of an anchor."""
@@ -411,8 +433,8 @@ def _find_obstacles(
 ) -> int:
     """Find the boxes at the height of a spot, but those that hold or surround the anchor.
 
-    Each result has the centre of a box, cos and sin of its yaw, and the distances at which the box
-    and the missing object touch, along the axes of the box and of the object.
+    Each result has the centre of a box, cos and sin of its yaw, and the minimum distances of
+    the box and the missing object, along the axes of the box and of the object.
     """
     area, count = size[0] * size[1], 0
     holder = int(boxes[i, _HOLDER]) if role in (_ON, _IN) else -1
@@ -435,16 +457,16 @@ def _find_obstacles(
             width, depth = _extents(size[0], size[1], cos, sin)
             own_width, own_depth = _extents(x, y, cos, sin)
             row[0], row[1], row[2], row[3] = boxes[k, _X], boxes[k, _Y], turn[0], turn[1]
-            row[4], row[5] = (x + width) / 2 - _ROUNDING, (y + depth) / 2 - _ROUNDING
-            row[6] = (size[0] + own_width) / 2 - _ROUNDING
-            row[7] = (size[1] + own_depth) / 2 - _ROUNDING
+            row[4], row[5] = (x + width) / 2 + _MARGIN, (y + depth) / 2 + _MARGIN
+            row[6] = (size[0] + own_width) / 2 + _MARGIN
+            row[7] = (size[1] + own_depth) / 2 + _MARGIN
             count += 1
     return count
 
 
 @compiled
 def _is_free(obstacles: Float[NDArray, "m 8"], point: Pair, turn: Pair) -> bool:
-    """Return whether a footprint overlaps no obstacle.
+    """Return whether a footprint has a gap to each obstacle.
 
     Two rectangles overlap if and only if their projections on each of their four sides overlap.
     """
