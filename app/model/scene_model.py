@@ -19,12 +19,20 @@ from app.model.possibility import Possibility, UnitsWithPrior
 from app.model.statistics import Counts, Offsets, Places
 from app.model.word_weights import RowMap
 from app.scene.roles import RoleCounts
+from app.scene.spatial_relations import ON_TOP
+from app.scene.stands import SUPPORTED, USUAL
 from app.scene.vocabulary import Vocabulary, Word
 
 _MOST_KEPT: Final = 4  # models with words that a model keeps, of about 20 MB each
 
 RARELY: Final = 1 / 500
 """A class is rarely shown if a smaller share of the training scenes shows it."""
+
+_LEAST_SCENES: Final = 20  # minimum number of scenes of a pair that shows the height of a seat
+_HIGHEST_SEAT: Final = 0.8  # maximum height of a seat, as a share of the height of the furniture
+# Maximum median spread of the heights of things, as a share of the height of the furniture. Things
+# in furniture with several shelves have a larger spread.
+_SEAT_SPREAD: Final = 0.28
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +106,36 @@ class SceneModel:
             return np.zeros(self.spec.V, np.bool_)
         popularity = np.array(self.calibration.popularity, dtype=np.float64)
         return ~(popularity >= math.log(RARELY / (1 - RARELY)))  # NaN: no training scene
+
+    @cached_property
+    def seats(self) -> Float[NDArray[np.float64], "V"]:
+        """Height in metres of the seat of each class above its bottom, or infinity without a seat.
+
+        The boxes of beds, sofas and chairs include a headboard or a back, so things lie below the
+        top face. The seat is the lowest mean height of the bottoms of things of one class. A kind
+        without statistics has the seat of its broader class.
+        """
+        sizes = self.vocabulary.sizes
+        seats, is_known = np.full(len(sizes), math.inf), np.zeros(len(sizes), np.bool_)
+        if self.offsets is None or self.places is None:
+            return seats
+        offsets, (_, V, _) = self.offsets, self.offsets.subject.shape
+        relation, thing, other = offsets.pair // V // V, offsets.pair // V % V, offsets.pair % V
+        height, typical = sizes[thing, 2], sizes[other, 2]
+        bottoms = offsets.pair_offset[:, 2] - height / 2 + typical / 2
+        is_shown = (relation == ON_TOP) & (offsets.pair_scenes >= _LEAST_SCENES)
+        is_shown &= (height < typical) & (self.places.stands[thing, SUPPORTED] >= USUAL)
+        for j in np.unique(other[is_shown]).tolist():
+            rows, is_known[j] = is_shown & (other == j), True
+            lowest, spread = bottoms[rows].min(), np.median(offsets.pair_offset[rows, 5])
+            if lowest < _HIGHEST_SEAT * sizes[j, 2] and spread <= _SEAT_SPREAD * sizes[j, 2]:
+                seats[j] = lowest
+        ancestors = self.vocabulary.parents.copy()
+        while (has_parent := ~is_known & (ancestors >= 0)).any():
+            seats[has_parent] = seats[ancestors[has_parent]]
+            is_known[has_parent] = is_known[ancestors[has_parent]]
+            ancestors[has_parent] = self.vocabulary.parents[ancestors[has_parent]]
+        return seats
 
     @cached_property
     def row_map(self) -> RowMap:

@@ -212,53 +212,60 @@ class Offsets(TensorGroup):
 
 
 @compiled
-def rotated_offsets(
+def offsets_of_missing(
     tables: tuple[NDArray[Any], ...],  # `Offsets.tables`
     relation: Int[NDArray, " n"],
     missing: Int[NDArray, " n"],  # classes of the missing objects
     anchor: Int[NDArray, " n"],  # classes of the anchors
     outgoing: Bool[NDArray, " n"],  # whether the missing object is the relation's subject
-    axes: Float[NDArray, "3 3"],  # see `viewer_axes`, in the frame of the offsets
+    has_viewer: bool,
 ) -> tuple[Float[NDArray, "n 3"], Float[NDArray, "n 3"], Int[NDArray, " n"]]:
     """Return mean and standard deviation of the offset from each anchor to its missing object.
 
-    Lengths are in metres. The third result is the number of training scenes with the two classes in
-    this relation, or `UNOBSERVED` for an unknown offset. If the first axis is zero, the viewing
-    direction is unknown: left and front have no offset, and other offsets have vertical means.
+    Lengths are in metres, along the viewer's axes. The third result is the number of training
+    scenes with the two classes in this relation, or `UNOBSERVED` for an unknown offset. Without a
+    viewer, left and front have no offset, and the means of other offsets are vertical.
     """
-    n, has_direction = len(relation), axes[0].any()
+    n = len(relation)
     subject, object_ = np.empty(n, np.int64), np.empty(n, np.int64)
     for k in range(n):
         subject[k], object_[k] = missing[k], anchor[k]
         if not outgoing[k]:
             subject[k], object_[k] = anchor[k], missing[k]
     offset, scenes = _look_up_offsets(tables, relation, subject, object_)
-    mean, variance, std = np.zeros((n, 3)), np.zeros((n, 3)), np.empty((n, 3))
+    mean, std = np.zeros((n, 3)), np.empty((n, 3))
     for k in range(n):
-        if has_direction:
-            for axis in range(3):
-                axis_mean, axis_variance = offset[k, axis], offset[k, 3 + axis] ** 2
-                for to in range(3):
-                    mean[k, to] += axes[axis, to] * axis_mean
-                    variance[k, to] += axes[axis, to] ** 2 * axis_variance
-        else:
+        sign = 1.0 if outgoing[k] else -1.0
+        for axis in range(3):
+            mean[k, axis], std[k, axis] = sign * offset[k, axis], offset[k, 3 + axis]
+        if not has_viewer:
             if relation[k] == LEFT or relation[k] == FRONT:
                 scenes[k] = UNOBSERVED
-            # Any horizontal direction is equally likely, so the two horizontal axes share
-            # E[x²] + E[y²] equally.
-            half = (offset[k, 0] ** 2 + offset[k, 3] ** 2) / 2
-            half += (offset[k, 1] ** 2 + offset[k, 4] ** 2) / 2
-            for to in range(3):
-                share = axes[2, to] ** 2
-                mean[k, to] = axes[2, to] * offset[k, 2]
-                variance[k, to] = share * offset[k, 5] ** 2 + (1.0 - share) * half
-        for axis in range(3):
-            value = mean[k, axis] if outgoing[k] else -mean[k, axis]
-            # Adding 0.0 turns -0.0 into 0.0.
-            mean[k, axis] = np.rint(value * _PER_METRE) / _PER_METRE + 0.0
-            millimetres = np.rint(math.sqrt(variance[k, axis]) * _PER_METRE)
-            std[k, axis] = max(millimetres, 1.0) / _PER_METRE
+            # Any horizontal direction is equally likely, so x and y share E[x²] + E[y²] equally.
+            square = mean[k, 0] ** 2 + mean[k, 1] ** 2 + std[k, 0] ** 2 + std[k, 1] ** 2
+            for axis in range(2):
+                mean[k, axis], std[k, axis] = 0.0, math.sqrt(square / 2)
     return mean, std, scenes
+
+
+@compiled
+def rotated(
+    mean: Float[NDArray, "n 3"],
+    std: Float[NDArray, "n 3"],
+    axes: Float[NDArray, "3 3"],  # of the viewer, in the frame of the results
+) -> tuple[Float[NDArray, "n 3"], Float[NDArray, "n 3"]]:
+    """Return means and standard deviations in another frame, rounded to millimetres."""
+    means, stds = np.empty_like(mean), np.empty_like(std)
+    for k in range(len(mean)):
+        for to in range(3):
+            value = variance = 0.0
+            for axis in range(3):
+                value += axes[axis, to] * mean[k, axis]
+                variance += (axes[axis, to] * std[k, axis]) ** 2
+            # Adding 0.0 turns -0.0 into 0.0.
+            means[k, to] = np.rint(value * _PER_METRE) / _PER_METRE + 0.0
+            stds[k, to] = max(np.rint(math.sqrt(variance) * _PER_METRE), 1.0) / _PER_METRE
+    return means, stds
 
 
 @compiled

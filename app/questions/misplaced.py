@@ -255,7 +255,7 @@ def _standing(model: SceneModel, scene: Scene, evidence: _Evidence) -> Standing:
     usual_height = vocabulary.sizes[evidence.classes, 2]
     is_top = (shares[:, FLOOR] >= USUAL) & (extents[:, 2] < usual_height / 2)
     bottoms = centres[:, 2] - extents[:, 2] / 2
-    floor = floor_level(bottoms, np.where(is_top, 0.0, shares[:, FLOOR]), errors[:, 1])
+    floor = floor_level(bottoms, np.where(is_top, 0.0, shares[:, FLOOR]), errors[:, 1].copy())
     reached = np.fmax(bottoms + extents[:, 2] - usual_height, floor)
     longer = np.where(is_top, np.fmax(bottoms - reached, 0.0), 0.0)
     centres[:, 2] -= longer / 2

@@ -31,7 +31,7 @@ from app.questions.question import LABELS, REFUSED, SCENES, Example, Options, Qu
 from app.questions.reading import Reading
 from app.scene.scene import Scene
 from app.scene.spatial_relations import CANONICAL, opposite
-from scene_client.frames import Axes, viewer_axes
+from scene_client.frames import Axes, is_world_fixed, viewer_axes
 from scene_client.schemas import Anchor, MissingAnswer, MissingRequest
 
 VIEWER = viewer_axes()  # axes of a viewer who looks along the x axis of the frame
@@ -57,6 +57,7 @@ def missing(
     at: tuple[str, int] | None = None,  # a place: (relation, index of the anchor object)
     coverage: float | None = None,  # listed share of the classes of the scene; None: unknown
     axes: Axes = VIEWER,  # see `viewer_axes`
+    has_viewer: bool = True,  # whether the viewing direction is known
     details: bool = True,  # whether the answer contains `placements` and `because`
 ) -> Fields:
     """Rank the unlisted classes by the probability that they are present, likeliest first.
@@ -92,7 +93,9 @@ def missing(
         entry["probability"], entry["log_odds"] = probability, value
         entries.append(entry)
     if details and entries:
-        places = placements(model, posterior, scene, classes, axes, place)
+        places = placements(
+            model, posterior, scene, classes, axes, place, has_viewer=has_viewer
+        )
         for entry, class_places in zip(entries, places, strict=True):
             entry["placements"], entry["because"] = class_places, []
         if place is not None:
@@ -284,6 +287,7 @@ def _read(request: MissingRequest, model: SceneModel, reading: Reading) -> Optio
         "at": at,
         "coverage": request.coverage,
         "axes": viewer_axes(request.frame_id, None if view is None else view.yaw, request.up),
+        "has_viewer": view is not None or not is_world_fixed(request.frame_id),
         "details": request.detail == "full",
     }
 

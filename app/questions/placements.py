@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from app.compiling import compiled
 from app.inference.elementary import NO_UNIT
 from app.model.scene_model import SceneModel
-from app.model.statistics import UNOBSERVED, rotated_offsets
+from app.model.statistics import UNOBSERVED, offsets_of_missing, rotated
 from app.questions.answer import Fields, best, significant
 from app.questions.posterior import Posterior, exclusive, relation_probability
+from app.questions.spots import move_to_free_spots
 from app.scene.scene import Scene, boxes_of
 from app.scene.spatial_relations import INSIDE, ON_TOP, RELATIONS, SUPPORTS, canonicalise, opposite
 from app.scene.vocabulary import do_not_fit
@@ -65,6 +66,8 @@ def placements(
     candidates: Int[Indices, "N"],  # absent classes
     axes: Axes,  # see `viewer_axes`
     at: Place | None = None,  # the requested place, which comes first in each result
+    *,
+    has_viewer: bool = True,  # whether the viewing direction is known
 ) -> list[list[Fields]]:
     """Return the likeliest relations of each candidate to the listed objects, likeliest first.
 
@@ -95,10 +98,11 @@ def placements(
             first = ((0 if at.outgoing else A) + at.relation) * len(anchors) + column
             objects[column] = at.anchor
     things = [scene.objects[number] for number in objects.tolist()]
+    sizes = model.vocabulary.sizes
+    has_sizes = any(thing.size is not None for thing in scene.objects)
+    boxes = boxes_of(scene.objects, sizes) if has_sizes else None
     if A > INSIDE:
-        sizes = model.vocabulary.sizes
-        has_sizes = any(thing.size is not None for thing in things)
-        of_things = boxes_of(things, sizes)[1] if has_sizes else sizes[classes]
+        of_things = sizes[classes] if boxes is None else boxes[1][objects]
         candidates_too_large, things_too_large = do_not_fit(sizes[candidates], of_things)
         forward[:, INSIDE][candidates_too_large] = NO_UNIT
         backward[:, INSIDE][things_too_large] = NO_UNIT
@@ -108,14 +112,16 @@ def placements(
     )
     offsets: Iterator[Fields | None] = repeat(None)
     if model.offsets is not None and any(thing.position is not None for thing in things):
-        mean, std, scenes = rotated_offsets(
-            model.offsets.tables,
-            relations,
-            candidates[rows],
-            classes[columns],
-            outgoing,
-            np.array(axes),
+        places = relations, candidates[rows]
+        mean, std, scenes = offsets_of_missing(
+            model.offsets.tables, *places, classes[columns], outgoing, has_viewer
         )
+        if boxes is not None:
+            anchors = objects[columns]
+            move_to_free_spots(
+                model, scene, present, boxes, *places, outgoing, anchors, mean, std, scenes
+            )
+        mean, std = rotated(mean, std, np.array(axes))
         offsets = _offset_fields(mean, std, scenes)
     entries: list[list[Fields]] = [[] for _ in candidates]
     arrays = rows.tolist(), relations.tolist(), outgoing.tolist(), columns.tolist()

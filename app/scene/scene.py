@@ -213,7 +213,8 @@ def observe(
     far = excluded_by_centres(points, sizes, horizontal=has_viewer)
     if scene.relations is not None:
         excluded = far | (poses.observed & (poses.probability < POSSIBLE))
-        return replace(scene, relations=scene.relations.excluding(excluded, EXCLUDED))
+        table = scene.relations.excluding(excluded, EXCLUDED)
+        return replace(scene, objects=objects, relations=table)
     table = RelationTable.shown_by_boxes(poses.probability, poses.observed, far)
     return replace(scene, objects=objects, relations=table)
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
+from app.compiling import compiled
 from app.scene.scene import CONTACT
 from app.scene.spatial_relations import ABOVE, INSIDE, ON_TOP
 
@@ -24,8 +25,10 @@ USUAL: Final = 0.5  # share of a stand that is usual for a class
 _UNIFORM: Final = 0.4  # density per metre of heights above the floor
 _ERROR: Final = 0.05  # share of boxes at a wrong height
 _SMALLEST: Final = 0.02  # smallest error in metres
+_SQRT_2_PI: Final = math.sqrt(2 * math.pi)
 
 
+@compiled
 def floor_level(
     bottoms: Float[NDArray, " n"], shares: Float[NDArray, " n"], errors: Float[NDArray, " n"]
 ) -> float:
@@ -38,15 +41,20 @@ def floor_level(
 
     Boxes with S below `USUAL` are no candidates. Without any candidate, the height is NaN.
     """
-    known = np.isfinite(bottoms + errors)
-    bottoms, shares, errors = bottoms[known], shares[known], np.maximum(errors[known], _SMALLEST)
-    candidates = bottoms[shares >= USUAL]
-    if not len(candidates):
-        return math.nan
-    distance = bottoms - candidates[:, None]
-    at_floor = np.exp(-0.5 * (distance / errors) ** 2) / (errors * math.sqrt(2 * math.pi))
-    above = (1 - shares) * _UNIFORM * (distance >= -errors) + _ERROR * _UNIFORM
-    return float(candidates[np.log(shares * at_floor + above).sum(1).argmax()])
+    likeliest, level = -math.inf, math.nan
+    for f in range(len(bottoms)):
+        if not (math.isfinite(bottoms[f]) and shares[f] >= USUAL):
+            continue
+        log_p = 0.0
+        for i in range(len(bottoms)):
+            error, distance = max(errors[i], _SMALLEST), bottoms[i] - bottoms[f]
+            if not math.isnan(distance):
+                p = shares[i] * math.exp(-0.5 * (distance / error) ** 2) / (error * _SQRT_2_PI)
+                p += _UNIFORM * ((1.0 - shares[i]) * (distance >= -error) + _ERROR)
+                log_p += math.log(p)
+        if log_p > likeliest:
+            likeliest, level = log_p, bottoms[f]
+    return level
 
 
 @dataclass(frozen=True)

@@ -198,10 +198,10 @@ def warm_up(artifact: Artifact) -> None:
 
 
 def _scene(vocabulary: Vocabulary) -> Scene:
-    """Return a scene of up to three objects in a row. The second object is on top of the first."""
+    """Return a scene of up to three boxes in a row. The second object is on top of the first."""
     proposable = [i for i, entry in enumerate(vocabulary.objects) if not entry.structure]
     objects = tuple(
-        SceneObject(str(k), vocabulary.labels[index], index, position=(1.0, 0.5 * k, 0.5))
+        SceneObject(str(k), vocabulary.labels[index], index, 1.0, (1.0, 0.5 * k, 0.5), (0.3,) * 3)
         for k, index in enumerate((proposable or [0])[:3])
     )
     relations = RelationTable.stated([(ON_TOP, 1, 0)]) if len(objects) > 1 else None

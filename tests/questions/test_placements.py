@@ -15,7 +15,7 @@ from scipy.special import expit, logit
 
 from app.model import CountSlope, Offsets
 from app.model.calibration import PlaceFit
-from app.model.statistics import UNOBSERVED, rotated_offsets
+from app.model.statistics import UNOBSERVED, offsets_of_missing, rotated
 from app.questions.placements import Place, place_log_p, placements
 from app.questions.posterior import Posterior
 from app.scene import RELATIONS, ObjectClass, Scene, SceneObject, Vocabulary
@@ -110,7 +110,8 @@ VIEWER = viewer_axes()
 
 def offset_of(relation, missing, anchor, outgoing=True, axes=VIEWER, offsets=OFFSETS):
     ends = (np.array([value]) for value in (relation, missing, anchor, outgoing))
-    values = rotated_offsets(offsets.tables, *ends, np.array(axes))
+    mean, std, scenes = offsets_of_missing(offsets.tables, *ends, axes is not None)
+    values = *rotated(mean, std, np.eye(3) if axes is None else np.array(axes)), scenes
     mean, std, scenes = (value[0].tolist() for value in values)
     return None if scenes == UNOBSERVED else Offset(tuple(mean), tuple(std), scenes)
 
@@ -140,8 +141,8 @@ def test_the_offset_turns_with_the_viewer(yaw, optical):
 
 def test_unknown_offsets():
     """Left and front without a viewer, and relations without poses in training."""
-    assert offset_of(LEFT, 1, 2, axes=viewer_axes("map")) is None
-    assert offset_of(FRONT, 1, 2, outgoing=False, axes=viewer_axes("map")) is None
+    assert offset_of(LEFT, 1, 2, axes=None) is None
+    assert offset_of(FRONT, 1, 2, outgoing=False, axes=None) is None
     none = {"pair": np.zeros(0, np.int64), "pair_offset": np.zeros((0, 6), "f4")}
     counts = {"relation_scenes": np.array([1, 0, 9, 9, 9]), "pair_scenes": np.zeros(0, np.int64)}
     partial = replace(OFFSETS, **counts, **none)

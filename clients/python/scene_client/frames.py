@@ -176,7 +176,6 @@ CONVENTIONS: Final = ("up", "units", "extents", "box_origin", "quaternion_order"
 
 _IDENTITY: Final[Axes] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 _UPRIGHT: Final = (0, 1, 2)  # axes of a box that are ahead, aside and up
-_UNKNOWN: Final[Vector] = (0.0, 0.0, 0.0)
 
 
 def viewer_axes(
@@ -184,7 +183,6 @@ def viewer_axes(
 ) -> Axes:
     """Return the viewer's axes (x away, y left, z up) as vectors of a frame.
 
-    In a world-fixed frame without a viewing direction, away and left are unknown: zero vectors.
     Without a name, the frame has body axes. The viewing direction is ``yaw`` in radians from the
     body axis x, or else this axis. ``up`` is the axis of the frame that points up, by default z, or
     -y in an optical frame.
@@ -193,8 +191,6 @@ def viewer_axes(
     if yaw is not None:
         cos, sin = math.cos(yaw), math.sin(yaw)
         away, left = (cos, sin, 0.0), (-sin, cos, 0.0)
-    elif is_world_fixed(frame_id):
-        away = left = _UNKNOWN
     direction = "-y" if is_optical(frame_id) else up or "z"
     return to_frame(away, direction), to_frame(left, direction), to_frame(above, direction)
 

@@ -70,6 +70,13 @@ class Offset:
     standard deviations in the plane, or within 2.15 in space. `scenes` is the number of training
     scenes with this relation between the two classes. If `scenes` is 0, the offset is estimated
     from the relation and from each class separately.
+
+    If the request states the size of `object`, `mean` is a free spot for a missing object of the
+    typical size, with the yaw of `object`. It overlaps no other box. On top, it touches the top
+    face of `object`, or the seat of a bed, a sofa or a chair. Inside, it is between bottom and top
+    of `object`. Otherwise it stands on the floor or on a box, or hangs at the usual height. Below
+    an object that it supports, it reaches from the floor to this object. For on-top, inside, above
+    and their opposites, `std` is at most what the surface leaves to the centre.
     """
 
     mean: Vector
@@ -86,7 +93,9 @@ class Placement(Reply):
     offset: Offset | None = None
     """offset from `object` in metres. The offset is absent if `object` has no position, or if the
     training scenes have no poses. It is also absent for left, right, front and behind in a map,
-    odom or world frame without a viewpoint"""
+    odom or world frame without a viewpoint. If the request states the size of `object` and no spot
+    is free, the offset is absent too. Then the place is as probable, but an arm has no room there:
+    take the next place with an offset"""
 
 
 class MissingObject(Reply):
