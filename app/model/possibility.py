@@ -111,7 +111,11 @@ class Possibility(TensorGroup):
     def holders(self) -> Float[Table, "V 3"]:
         """Shares of the floor, of a wall or the ceiling, and of other objects; see `Places`."""
         walls, objects = slice(AT_WALL, AT_SURFACE), slice(AT_SURFACE, None)
-        columns = self.stands[:, AT_FLOOR], self.stands[:, walls].sum(1), self.stands[:, objects].sum(1)
+        columns = (
+            self.stands[:, AT_FLOOR],
+            self.stands[:, walls].sum(1),
+            self.stands[:, objects].sum(1),
+        )
         return np.stack(columns, axis=1)
 
     @cached_property

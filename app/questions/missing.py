@@ -93,9 +93,7 @@ def missing(
         entry["probability"], entry["log_odds"] = probability, value
         entries.append(entry)
     if details and entries:
-        places = placements(
-            model, posterior, scene, classes, axes, place, has_viewer=has_viewer
-        )
+        places = placements(model, posterior, scene, classes, axes, place, has_viewer=has_viewer)
         for entry, class_places in zip(entries, places, strict=True):
             entry["placements"], entry["because"] = class_places, []
         if place is not None:

@@ -20,7 +20,15 @@ from app.questions.answer import Fields, best, significant
 from app.questions.posterior import Posterior, exclusive, relation_probability
 from app.questions.spots import move_to_free_spots
 from app.scene.scene import Scene, boxes_of
-from app.scene.spatial_relations import INSIDE, ON_TOP, RELATIONS, SUPPORTS, canonicalise, opposite
+from app.scene.spatial_relations import (
+    ABOVE,
+    INSIDE,
+    ON_TOP,
+    RELATIONS,
+    SUPPORTS,
+    canonicalise,
+    opposite,
+)
 from app.scene.vocabulary import do_not_fit
 from scene_client.frames import Axes
 
@@ -101,8 +109,14 @@ def placements(
     sizes = model.vocabulary.sizes
     has_sizes = any(thing.size is not None for thing in scene.objects)
     boxes = boxes_of(scene.objects, sizes) if has_sizes else None
+    of_things = sizes[classes] if boxes is None else boxes[1][objects]
+    if A > ON_TOP:
+        smaller = _smaller_anchors(sizes[candidates], of_things)
+        for a in (ON_TOP, ABOVE):
+            backward[:, a][smaller] = NO_UNIT
+        forward[:, ON_TOP][smaller] = NO_UNIT
     if A > INSIDE:
-        of_things = sizes[classes] if boxes is None else boxes[1][objects]
+        backward[:, INSIDE][smaller] = NO_UNIT
         candidates_too_large, things_too_large = do_not_fit(sizes[candidates], of_things)
         forward[:, INSIDE][candidates_too_large] = NO_UNIT
         backward[:, INSIDE][things_too_large] = NO_UNIT
@@ -135,6 +149,18 @@ def placements(
             entry["offset"] = offset
         entries[row].append(entry)
     return entries
+
+
+def _smaller_anchors(
+    sizes: Float[NDArray[np.float64], "N 3"], anchors: Float[NDArray[np.float64], "m 3"]
+) -> Bool[NDArray[np.bool_], "N m"]:
+    """Return which of m anchors have a smaller footprint than which of N candidates.
+
+    Nobody looks for a bed under a teddy bear, so a smaller anchor has no stacked placement.
+    """
+    # A comparison with NaN is False.
+    smaller: Bool[NDArray[np.bool_], "N m"] = anchors[:, :2].prod(1) < sizes[:, :2].prod(1)[:, None]
+    return smaller
 
 
 def supported_objects(model: SceneModel, posterior: Posterior, scene: Scene) -> list[int]:

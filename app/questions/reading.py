@@ -175,8 +175,11 @@ def _objects(
             detections[len(objects)] = entry
             known = unknown.vocabulary.objects
             typical = known[index].size if index < len(known) else None
-            position, size, yaw = _box(entry, conventions, typical)
-            objects.append(SceneObject(name, label, index, entry.confidence, position, size, yaw))
+            box = (
+                *_box(entry, conventions, typical),
+                *conventions.errors(entry.position_std, entry.size_std),
+            )
+            objects.append(SceneObject(name, label, index, entry.confidence, *box))
     return tuple(objects), detections
 
 

@@ -69,7 +69,8 @@ def relations(
 
     Returns:
         The fields `relations` and `disagreements` of `scene_client.schemas.RelationsAnswer`. The
-        likeliest relation comes first. The disagreement with the largest ratio of `probability` to
+        likeliest relation comes first. Without `pairs` and opposites, a table "on top of" a chair
+        is a chair under a table, if people say so. The disagreement with the largest ratio of `probability` to
         `observed_probability` comes first. Entries with equal values are ordered by their indices.
         If the training scenes of the model have no relations, the answer lists observed relations
         only. Then the field `warnings` says so.
@@ -98,11 +99,13 @@ def relations(
     expected = significant(of_model)
     disagreements = _disagreements(model, scene, posterior, judged, top_k=top_k, least=least)
     names, observed, things = relation_names(A), set(scene.triples), scene.objects
-    judges = model.spec.judges_relations
+    judges, by_usual_words = model.spec.judges_relations, pairs is None and not include_opposites
     entries: list[Fields] = []
     for subject, object_, kind, probability, own in zip(*columns, expected, strict=True):
         pair = (subject, object_) if kind < A else (object_, subject)
         is_observed = (kind % A, *pair) in observed
+        if by_usual_words and kind == ON_TOP and means_under(model, posterior, *pair):
+            kind, subject, object_ = kind + A, object_, subject
         if probability < min_probability or not (judges or is_observed):
             continue
         entry: Fields = {
@@ -117,6 +120,13 @@ def relations(
         entries.append(entry)
     warnings = [] if judges else [_NO_RELATIONS]
     return {"relations": entries, "disagreements": disagreements, "warnings": warnings}
+
+
+def means_under(model: SceneModel, posterior: Posterior, upper: int, lower: int) -> bool:
+    """Return whether "upper on top of lower" means lower under upper, as with desk and bin."""
+    classes = model.vocabulary.stand_in[posterior.present.classes][posterior.present.row]
+    places = model.places
+    return places is not None and places.means_under(int(classes[upper]), int(classes[lower]))
 
 
 def _evidence(

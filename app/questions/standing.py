@@ -116,7 +116,9 @@ def standing(
             if deep > sunk:
                 sunk, deepest = deep, j
         usual += shares[i, 2] * unlisted[i] * (1.0 - _BLOCKED * over) * unheld
-        wrong = np.array([at_floor, total / max(near, 1.0), (1.0 - below) * uniform, sunk * uniform])
+        wrong = np.array(
+            [at_floor, total / max(near, 1.0), (1.0 - below) * uniform, sunk * uniform]
+        )
         for place in range(4):
             wrong[place] *= WRONG[place]
         reason[i] = wrong.argmax()

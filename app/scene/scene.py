@@ -429,9 +429,7 @@ def _relate_all(
                 smaller = min(extents[i, 0] * extents[i, 1], extents[j, 0] * extents[j, 1])
                 overlap = normal_share((share - MIN_OVERLAP) * math.sqrt(smaller), error)
                 if overlap >= POSSIBLE:
-                    stacked = _stack(
-                        boxes, i, j, overlap, classes, roles, probability, observed
-                    )
+                    stacked = _stack(boxes, i, j, overlap, classes, roles, probability, observed)
             if neighbours and horizontal and stacked < HOLDS:
                 for subject, anchor in ((i, j), (j, i)):
                     to_front = points[anchor, 0] - points[subject, 0]

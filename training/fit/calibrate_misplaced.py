@@ -61,8 +61,13 @@ _OF_WORDS: Final = 0.1  # weight of an altered on-top that is asked in the words
 _LENGTHS: Final = (1, 2, 4, 8, 16, 32)  # numbers of entries to which the alarm lines are fitted
 # Share of the alarms that each kind of entry may raise, without boxes and with boxes.
 _BUDGET: Final = {
-    "lateral": 0.1, "support": 0.7, "above": 0.1, "under": 0.1,
-    "on_floor": 0.15, "on_object": 0.2, "unheld": 0.15,
+    "lateral": 0.1,
+    "support": 0.7,
+    "above": 0.1,
+    "under": 0.1,
+    "on_floor": 0.15,
+    "on_object": 0.2,
+    "unheld": 0.15,
 }
 
 
@@ -226,9 +231,7 @@ def _fit_kind(cases: _Cases, budget: float, *, posed: bool) -> Judgement | None:
     return judgement.model_copy(update={"lines": _alarm_lines(judgement, untouched, budget, posed)})
 
 
-def _alarm_lines(
-    judgement: Judgement, untouched: _Cases, budget: float, posed: bool
-) -> AlarmLines:
+def _alarm_lines(judgement: Judgement, untouched: _Cases, budget: float, posed: bool) -> AlarmLines:
     """Fit the alarm lines to the highest log-odds among n random entries of untouched scenes.
 
     Lines of boxes do not depend on n: they are fitted to all entries of each scene.
@@ -244,7 +247,9 @@ def _alarm_lines(
         long_enough = [k for k, values in enumerate(lists) if len(values) >= n]
         if len(long_enough) < LEAST_SCENES:
             break
-        highest = np.array([rng.permutation(lists[k])[: None if posed else n].max() for k in long_enough])
+        highest = np.array(
+            [rng.permutation(lists[k])[: None if posed else n].max() for k in long_enough]
+        )
         for name, share in ALARMS.items():
             limit = hardest_quantile(highest, sources[long_enough], 1 - budget * share)
             points[name].append((float(np.log(n)), limit))

@@ -55,7 +55,12 @@ _STATED: Final = {
     "inside": (IN, True), "contains": (IN, False),
 }  # fmt: skip
 # Relation that does not hold if a place is impossible, and whether its subject is at the place.
-_DENIED: Final = {ON: (ON_TOP, True), UNDER: (ON_TOP, False), OVER: (ABOVE, True), IN: (INSIDE, True)}
+_DENIED: Final = {
+    ON: (ON_TOP, True),
+    UNDER: (ON_TOP, False),
+    OVER: (ABOVE, True),
+    IN: (INSIDE, True),
+}
 
 Pair = tuple[int, int, int]  # place, class at this place, and class of the other object
 
@@ -181,7 +186,8 @@ def _fit_place(
     wrong = {
         pair: n
         for (a, i, j), n in impossible.items()
-        if a == relation and (pair := (i, j) if outgoing else (j, i)) not in seen
+        if a == relation
+        and (pair := (i, j) if outgoing else (j, i)) not in seen
         and not (place == ON and (UNDER, pair[1], pair[0]) in possible)
     }
     if not right or not wrong:

@@ -93,6 +93,17 @@ class Conventions(NamedTuple):
             up = "-y"
         return cls(up, scene.units, scene.extents, scene.box_origin, scene.quaternion_order)
 
+    def errors(
+        self, position: float | None, size: float | None
+    ) -> tuple[float | None, float | None]:
+        """Convert the standard deviations of a position and of a size to metres. None stays None."""
+        metres = METRES[self.units]
+        of_size = metres if self.extents == "full" else 2 * metres
+        return (
+            None if position is None else metres * position,
+            None if size is None else of_size * size,
+        )
+
     def box(
         self,
         position: Vector | None,
