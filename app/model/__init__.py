@@ -22,6 +22,6 @@ from app.model.statistics import Counts, Offsets, Places
 
 __all__ = [
     "AlarmLine", "AlarmLines", "Calibration", "CountSlope", "Counts", "CoverageFit", "FitLimit",
-    "Judgement", "Misplaced", "Offsets", "PlaceFit", "Places", "Possibility", "SceneModel", "Sensitivity",
-    "Sharpness",
+    "Judgement", "Misplaced", "Offsets", "PlaceFit", "Places", "Possibility", "SceneModel",
+    "Sensitivity", "Sharpness",
 ]  # fmt: skip

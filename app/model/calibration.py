@@ -143,8 +143,8 @@ class Judgement(Frozen):
     """The log-odds that an entry of `misplaced` is wrong, and the lines of an alarm.
 
     The log-odds are intercept + relation·z + change·d + stand·s + supporter·q + unknown·u +
-    entries·l, with the terms of `app.questions.misplaced`. n of the lines is the number of entries of the kind in
-    the scene.
+    entries·l, with the terms of `app.questions.misplaced`. n of the lines is the number of entries
+    of the kind in the scene.
     """
 
     intercept: float

@@ -59,8 +59,8 @@ class Possibility(TensorGroup):
 
     up to a constant of the place, with four features φ:
 
-        -log share of class i at such a place: on a surface (or on the floor, if class j is flat), on
-        the floor (under), on a wall or ceiling (above), or inside
+        -log share of class i at such a place: on a surface (or on the floor, if class j is flat),
+        on the floor (under), on a wall or ceiling (above), or inside
         1 - surface of class j (on, under), or 1 - container of class j (in)
         how much larger i is: log ratio of the footprints, and under, of the heights; in: sum of the
         log ratios of the three sides in order of size. Negative ratios count as 0
@@ -110,13 +110,8 @@ class Possibility(TensorGroup):
     @property
     def holders(self) -> Float[Table, "V 3"]:
         """Shares of the floor, of a wall or the ceiling, and of other objects; see `Places`."""
-        walls, objects = slice(AT_WALL, AT_SURFACE), slice(AT_SURFACE, None)
-        columns = (
-            self.stands[:, AT_FLOOR],
-            self.stands[:, walls].sum(1),
-            self.stands[:, objects].sum(1),
-        )
-        return np.stack(columns, axis=1)
+        parts = slice(AT_WALL), slice(AT_WALL, AT_SURFACE), slice(AT_SURFACE, None)
+        return np.stack([self.stands[:, part].sum(1) for part in parts], axis=1)
 
     @cached_property
     def _weights(self) -> Floats:

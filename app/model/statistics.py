@@ -15,6 +15,7 @@ from app.compiling import compiled
 from app.model.fields import TensorGroup
 from app.scene.roles import IN, ON, UNDER, RoleCounts, find_row, role_counts
 from app.scene.spatial_relations import CANONICAL, FRONT, LEFT, SUPPORTS
+from app.scene.stands import HANGS, USUAL
 
 Floats = NDArray[np.float64]
 Table = NDArray[np.float32]
@@ -402,9 +403,9 @@ class Places(TensorGroup):
         return math.log(counts[UNDER] ** 2 / (counts[ON] + counts[IN] + _OTHER_ROLES))
 
     def literal_share(self, upper: int, lower: int) -> float:
-        """Return the share of "upper on top of lower" whose words say this, not "lower under upper".
+        """Return how often "upper on top of lower" is said in these words: 1 without any "under".
 
-        It is 1 if no words say "under".
+        Other words of the same relation are "lower under upper".
         """
         on = float(role_counts(self.roles, upper, lower)[ON]) + _OTHER_ROLES
         return on / (on + float(role_counts(self.roles, lower, upper)[UNDER]))

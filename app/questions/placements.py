@@ -110,13 +110,12 @@ def placements(
     has_sizes = any(thing.size is not None for thing in scene.objects)
     boxes = boxes_of(scene.objects, sizes) if has_sizes else None
     of_things = sizes[classes] if boxes is None else boxes[1][objects]
-    if A > ON_TOP:
-        smaller = _smaller_anchors(sizes[candidates], of_things)
-        for a in (ON_TOP, ABOVE):
-            backward[:, a][smaller] = NO_UNIT
-        forward[:, ON_TOP][smaller] = NO_UNIT
+    smaller = _smaller_anchors(sizes[candidates], of_things)
+    for a in range(ON_TOP, A):
+        backward[:, a][smaller] = NO_UNIT
+        if a != ABOVE:
+            forward[:, a][smaller] = NO_UNIT
     if A > INSIDE:
-        backward[:, INSIDE][smaller] = NO_UNIT
         candidates_too_large, things_too_large = do_not_fit(sizes[candidates], of_things)
         forward[:, INSIDE][candidates_too_large] = NO_UNIT
         backward[:, INSIDE][things_too_large] = NO_UNIT

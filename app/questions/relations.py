@@ -69,9 +69,10 @@ def relations(
 
     Returns:
         The fields `relations` and `disagreements` of `scene_client.schemas.RelationsAnswer`. The
-        likeliest relation comes first. Without `pairs` and opposites, a table "on top of" a chair
-        is a chair under a table, if people say so. The disagreement with the largest ratio of `probability` to
-        `observed_probability` comes first. Entries with equal values are ordered by their indices.
+        likeliest relation comes first. Without `pairs` and opposites, a desk "on top of" a bin is
+        a bin under a desk, if people say so. The disagreement with the largest ratio of
+        `probability` to `observed_probability` comes first. Entries with equal values are ordered
+        by their indices.
         If the training scenes of the model have no relations, the answer lists observed relations
         only. Then the field `warnings` says so.
 

@@ -73,7 +73,7 @@ def standing(
     within: Float[NDArray, " N"],  # share k of the things of each object far below its top
 ) -> tuple[Float[NDArray, " N"], Int[NDArray, " N"], Int[NDArray, " N"]]:
     """Return the fields of `Standing`."""
-    points, extents, turns, errors = boxes
+    points, extents, _, errors = boxes
     N, uniform = len(points), 1.0 / ROOM
     log_ratio, reason, anchor = np.zeros(N), np.full(N, -1), np.full(N, -1)
     for i in range(N):

@@ -138,7 +138,10 @@ def _model(manifest: Manifest, tensors: dict[str, NDArray[Any]]) -> SceneModel:
         weights,
         manifest.vocabulary.vocabulary(),
         manifest.calibration,
-        *(read_group(group, table, *sizes) for group, table in zip(_GROUPS, tables, strict=True)),
+        read_group(Offsets, tables[0], *sizes),
+        read_group(Counts, tables[1], *sizes),
+        read_group(Places, tables[2], *sizes),
+        read_group(Possibility, tables[3], *sizes),
     )
 
 

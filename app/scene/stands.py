@@ -37,8 +37,9 @@ def floor_level(
     The bottom of a box is at the floor f with the share S of its class, with a normal error s, or
     else above it. Boxes below the floor are errors. So f maximises
 
-        Σ log( S · N(bottom - f; 0, s) + (1 - S) · U · [bottom ≥ f - s] + `_ERROR` · U ),  U = .4 / m
+        Σ log( S · N(bottom - f; 0, s) + (1 - S) · U · [bottom ≥ f - s] + `_ERROR` · U )
 
+    with U = .4 per metre.
     Boxes with S below `USUAL` are no candidates. Without any candidate, the height is NaN.
     """
     likeliest, level = -math.inf, math.nan

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
+from app.model import Possibility
 from app.scene import CANONICAL, RoleCounts, Vocabulary
 from training.datasets import EncodedScene
 from training.datasets.array_types import ClassMask, Table

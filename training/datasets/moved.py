@@ -6,7 +6,6 @@ two objects whose classes never stand on or in each other in the scene.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -172,16 +171,12 @@ def lifted_or_sunk(
 ) -> tuple[Scene, int] | None:
     """Return a scene with a box that floats or is sunk in, and the index of its object, or None."""
     boxes = _Boxes.of(encoded, structure)
+    lifts, usable = np.full(len(boxes.yaw), rng.uniform(*_FLOAT)), boxes.usable
     if rng.random() < 1 / 2:
-        candidates, step = boxes.usable, float(rng.uniform(*_FLOAT))
-    else:
-        depth = rng.uniform(*_SINK) * boxes.size[:, 2]
-        on_floor = boxes.bottom <= boxes.floor + CONTACT
-        candidates = boxes.usable & (depth >= _LEAST_SINK) & on_floor
-        step = math.nan
-    for i in rng.permutation(np.flatnonzero(candidates)).tolist():
-        group = boxes.group(i)
-        lift = -float(depth[i]) if math.isnan(step) else step
+        lifts = -rng.uniform(*_SINK) * boxes.size[:, 2]
+        usable = usable & (lifts <= -_LEAST_SINK) & (boxes.bottom <= boxes.floor + CONTACT)
+    for i in rng.permutation(np.flatnonzero(usable)).tolist():
+        group, lift = boxes.group(i), float(lifts[i])
         bottom = boxes.bottom[i] + lift
         tops = boxes.top[boxes.usable & ~group]
         if lift < 0 or (np.abs(tops - bottom) > _LEAST_SINK).all():

@@ -65,9 +65,9 @@ _BUDGET: Final = {
     "support": 0.7,
     "above": 0.1,
     "under": 0.1,
-    "on_floor": 0.15,
-    "on_object": 0.2,
-    "unheld": 0.15,
+    "on_floor": 0.4,
+    "on_object": 0.4,
+    "unheld": 0.3,
 }
 
 
@@ -167,11 +167,11 @@ def _questions(
         sizes = artifact.vocabulary.sizes
         spread, roles = artifact.spread, artifact.roles
         part = _part_of(untouched, scene_rng(encoded, seed + 2))
-        cases = [(untouched, None), (part, None), moved]
-        if has_boxes(encoded) and (
-            case := lifted_or_sunk(encoded, structure, scene_rng(encoded, seed + 3))
-        ):
-            cases.append(case)
+        cases: list[tuple[Scene, int | None]] = [(untouched, None), (part, None), moved]
+        if has_boxes(encoded):
+            cases.append(_part_with(*moved, scene_rng(encoded, seed + 2)))
+            if case := lifted_or_sunk(encoded, structure, scene_rng(encoded, seed + 3)):
+                cases += [case, _part_with(*case, scene_rng(encoded, seed + 5))]
         for shown, wrong in cases:
             yield observe(shown, typical_sizes=sizes, spread=spread, roles=roles), wrong
 
@@ -189,6 +189,16 @@ def _part_of(scene: Scene, rng: Rng) -> Scene:
     count = int(rng.integers(1, len(scene.objects) + 1))
     kept = np.sort(rng.permutation(len(scene.objects))[:count])
     return replace(scene, objects=tuple(scene.objects[k] for k in kept))
+
+
+def _part_with(scene: Scene, moved: int, rng: Rng) -> tuple[Scene, int]:
+    """Return a random part of a scene with boxes, with the moved object, and its index."""
+    chosen = rng.random(len(scene.objects)) < rng.uniform()
+    chosen[moved] = True
+    objects = tuple(
+        thing for thing, is_chosen in zip(scene.objects, chosen, strict=True) if is_chosen
+    )
+    return replace(scene, objects=objects), int(chosen[:moved].sum())
 
 
 def _truth(
@@ -219,6 +229,7 @@ def _fit_kind(cases: _Cases, budget: float, *, posed: bool) -> Judgement | None:
         *fitted, intercept = logistic(cases.terms[:, used], cases.wrong, cases.weight, C=RIDGE)
         weights[:] = 0.0
         weights[used] = fitted
+        weights[-1] = max(weights[-1], -1.0)  # at most one of n entries is wrong
         if (weights <= 0).all():
             break
         # A likelier relation, and a likelier stand, never make an entry more suspicious.

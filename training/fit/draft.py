@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy.typing import NDArray
 
 from app.model import Calibration, Places, Possibility, SceneModel
@@ -38,8 +38,8 @@ def draft_artifact(
 ) -> SceneModel:
     """Return a model in memory, without files. Its calibration leaves log-odds as is."""
     calibration = Calibration.neutral(machine.spec.A)
-    tables = {"places": places, "possibility": possibility}
-    return SceneModel(weights_of(machine), vocabulary, calibration, **tables)
+    weights = weights_of(machine)
+    return SceneModel(weights, vocabulary, calibration, places=places, possibility=possibility)
 
 
 def placed_draft(machine: BoltzmannMachine, data: TrainingData) -> SceneModel:
@@ -124,7 +124,7 @@ def _within(
         if scene.instance_positions is None or scene.instance_sizes is None:
             continue
         middle, half = scene.instance_positions[:, 2], scene.instance_sizes[:, 2] / 2
-        holds: Bool[NDArray, "N N"] = scene.instance_holds[[*SUPPORTS]].any(0)
+        holds = np.any(scene.instance_holds[[*SUPPORTS]], axis=0)
         i, j = np.nonzero(holds)
         depth = (middle + half)[j] - (middle - half)[i]
         known = np.isfinite(depth)

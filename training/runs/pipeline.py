@@ -184,7 +184,9 @@ def split_and_encode(
     if vocabulary is None:
         vocabulary = build_vocabulary(data, parts["train"], root)
     roles = count_roles(parts["train"], vocabulary)
-    encoded = {name: encode(part, vocabulary, roles) for name, part in parts.items()}
+    encoded: dict[str, list[EncodedScene]] = {
+        name: encode(part, vocabulary, roles) for name, part in parts.items()
+    }
     return SplitScenes(
         data=data,
         vocabulary=vocabulary,

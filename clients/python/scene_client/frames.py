@@ -96,7 +96,7 @@ class Conventions(NamedTuple):
     def errors(
         self, position: float | None, size: float | None
     ) -> tuple[float | None, float | None]:
-        """Convert the standard deviations of a position and of a size to metres. None stays None."""
+        """Convert standard deviations of a position and of a size to metres. None stays None."""
         metres = METRES[self.units]
         of_size = metres if self.extents == "full" else 2 * metres
         return (
