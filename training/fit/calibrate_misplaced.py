@@ -65,9 +65,9 @@ _BUDGET: Final = {
     "support": 0.7,
     "above": 0.1,
     "under": 0.1,
-    "on_floor": 0.4,
-    "on_object": 0.4,
-    "unheld": 0.3,
+    "on_floor": 0.5,
+    "on_object": 0.35,
+    "unheld": 0.25,
 }
 
 
