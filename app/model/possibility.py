@@ -41,7 +41,8 @@ FEATURES: Final = 4
 _FLAT: Final = 0.1  # maximum height in metres of a thing on which objects of the floor stand
 _LEAST_SHARE: Final = 0.01  # minimum share of a place
 _SCENES: Final = 2.0  # number of scenes with a relation that weigh as much as the prior
-_SHARE: Final = 0.5  # share of the prior in the log-odds of a relation that no scene shows
+PRIOR_SHARE: Final = 0.25
+"""Share of the prior in the logits of a relation that no scene shows; chosen by log-loss."""
 _SAID: Final = -2.3  # log of the share of "under" among the statements of on-top and under
 
 # Columns of the rows of things in the loops: logs of the shares of surface, inside, wall or
@@ -184,7 +185,7 @@ def known_share(scenes: Float[NDArray[np.floating], "..."]) -> Float[NDArray[np.
 class UnitsWithPrior(RelationUnits):
     """Relation units of a machine, whose logits of stacked relations have the prior added.
 
-    A relation of two classes that n training scenes show has the logit ℓ + (1 - k) c / 2. "The desk
+    A relation of two classes that n training scenes show has the logit ℓ + (1 - k) c / 4. "The desk
     is on top of the bin" may mean that the bin is under the desk, so on-top has the sum of both
     priors.
     """
@@ -246,4 +247,4 @@ def _add_prior(
                     c = _log_prior(weights, OVER if a == ABOVE else IN, rows[x], rows[y])
                 found = find_row(triple, (a * V + x) * V + y)
                 n = triple_scenes[found] if found >= 0 else 0.0
-                mean[b, row, p] += _SHARE * c * _SCENES / (n + _SCENES)
+                mean[b, row, p] += PRIOR_SHARE * c * _SCENES / (n + _SCENES)

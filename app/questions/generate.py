@@ -26,6 +26,7 @@ from app.compiling import compiled
 from app.errors import LocatedError, RareRoomTypeError
 from app.inference.chains import ChainState, ConditionedChains, Conditions, random_stream
 from app.inference.relation_units import encode
+from app.model.possibility import IN, ON, known_share
 from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, rounded_number
 from app.questions.names import ErrorList
@@ -35,11 +36,14 @@ from app.questions.question import BEDROOM, POSES, REFUSED, Example, Options, Qu
 from app.questions.reading import Reading
 from app.scene.relation_table import Triple
 from app.scene.scene import Scene, SceneObject
-from app.scene.spatial_relations import CANONICAL, ON_TOP
+from app.scene.spatial_relations import CANONICAL, ON_TOP, SUPPORTS, opposite
 from scene_client.schemas import GenerateAnswer, GenerateRequest
 
 STEPS: Final = 50
 """Default number of Gibbs sweeps for one drawn scene."""
+
+IMPOSSIBLE: Final = -4.0
+"""Log prior at which a drawn support is left out."""
 
 ATTEMPTS: Final = 8
 """Maximum number of draws for one scene."""
@@ -134,18 +138,48 @@ def _scene(
     a, i, j = units  # relation, and rows of subject and object in `state.classes`
     by_class = np.stack([a, state.classes[i], state.classes[j]], axis=1)
     stay = staying(by_class, state.logits[units], evidence, model.vocabulary.structure)
+    stay &= _possible(model, by_class, evidence)
     kept = np.zeros_like(state.r)
     kept[units] = stay
     triples = sorted({*map(tuple, by_class[stay].tolist()), *evidence})
     room = {} if state.room is None else {"room_type": room_types[state.room]}
     return room | {
         "objects": [labels[index] for index in state.classes[shown].tolist()],
-        "relations": [
-            {"subject": labels[i], "relation": CANONICAL[a], "object": labels[j]}
-            for a, i, j in triples
-        ],
+        "relations": [_told(model, *triple) for triple in triples],
         "log_score": rounded_number(chains.log_score(state, shown, kept)),
     }
+
+
+def _told(model: SceneModel, a: int, i: int, j: int) -> Fields:
+    """Return the `GeneratedRelation` in the usual words: a bin under a desk."""
+    labels, places = model.vocabulary.labels, model.places
+    if a == ON_TOP and places is not None and places.means_under(i, j):
+        return {"subject": labels[j], "relation": opposite(CANONICAL[a]), "object": labels[i]}
+    return {"subject": labels[i], "relation": CANONICAL[a], "object": labels[j]}
+
+
+def _possible(
+    model: SceneModel, triples: Int[NDArray[np.int64], "m 3"], evidence: Collection[Triple]
+) -> Bool[NDArray[np.bool_], "m"]:
+    """Return which drawn relations the prior of possibility admits, beside those of the evidence.
+
+    The prior counts less for relations that training scenes show, and not for a bin under a desk.
+    """
+    prior, places = model.possibility, model.places
+    admitted = np.ones(len(triples), np.bool_)
+    if prior is None or places is None:
+        return admitted
+    for row, (a, i, j) in enumerate(triples.tolist()):
+        if a not in SUPPORTS or (a, i, j) in evidence or (a == ON_TOP and places.means_under(i, j)):
+            continue
+        share = places.literal_share(i, j) if a == ON_TOP else 1.0
+        things, others = np.array([i]), np.array([j])
+        k = known_share(share * places.scenes((a,), things, others)[0, 0, 0])
+        c = prior.log_p(model.descriptions[things], model.descriptions[others])[
+            ON if a == ON_TOP else IN, 0, 0
+        ]
+        admitted[row] = (1.0 - k) * c > IMPOSSIBLE
+    return admitted
 
 
 def staying(

@@ -21,7 +21,8 @@ The log-odds that an entry is wrong are a weighted sum of six terms (`app.model.
     d   change of these log-odds by the other observed relations
     s   log share of objects of the class on or in objects; with boxes, -t of `Standing`
     q   log of the share of the supporter among the supporters of the class (`Places.supporters`)
-    u   1 - k, times the sum of these log-odds and of the prior (`app.model.possibility`)
+    u   1 - k, times the sum of these log-odds and of the part of the prior that they lack
+        (`app.model.possibility`)
     l   log of the number of entries, because hardly more than one entry of a scene is wrong
 
 k = n / (n + 2) is the share of the log-odds that n training scenes with the relation show. z, d, q
@@ -42,7 +43,7 @@ from numpy.typing import NDArray
 
 from app.inference.elementary import sigmoid
 from app.model.calibration import KINDS, WEIGHTS, Judgement, Sensitivity
-from app.model.possibility import IN, ON, OVER, UNDER, known_share
+from app.model.possibility import IN, ON, OVER, PRIOR_SHARE, UNDER, known_share
 from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, significant
 from app.questions.posterior import Posterior
@@ -81,7 +82,7 @@ THE_FLOOR: Final = "floor"
 """Name of the floor in an entry about an object that stands on the floor or floats above it."""
 
 LEAST_Z: Final = -8.0  # below it, log-odds do not tell wrong relations from rare ones
-_LEAST_P: Final = 1e-6  # minimum of a share
+_LEAST_P: Final = 3e-4  # minimum of a share
 LEAST_LISTED: Final = 0.05  # least probability of a listed box that is not on an object
 EXPLAINED: Final = 5.0
 """z of a confirmed relation; minimum z of an object above another object on a third object."""
@@ -172,7 +173,7 @@ class _Evidence:
         a, i, j = triple
         k = known_share(share * self.scenes[a - ON_TOP, self.row[i], self.row[j]])
         z, c = max(z, LEAST_Z), self.prior[place, self.row[thing], self.row[other]]
-        return float(k * z), float((1.0 - k) * (z + c))
+        return float(k * z), float((1.0 - k) * (z + (1.0 - PRIOR_SHARE) * c))
 
     def is_confirmed(self, a: int, i: int, j: int) -> bool:
         """Return whether a person has confirmed a relation of these classes."""

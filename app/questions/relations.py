@@ -105,7 +105,13 @@ def relations(
     for subject, object_, kind, probability, own in zip(*columns, expected, strict=True):
         pair = (subject, object_) if kind < A else (object_, subject)
         is_observed = (kind % A, *pair) in observed
-        if by_usual_words and kind == ON_TOP and means_under(model, posterior, *pair):
+        is_excluded = probability <= _MOST_EXCLUDED
+        if (
+            by_usual_words
+            and kind == ON_TOP
+            and not is_excluded
+            and means_under(model, posterior, *pair)
+        ):
             kind, subject, object_ = kind + A, object_, subject
         if probability < min_probability or not (judges or is_observed):
             continue

@@ -1,7 +1,7 @@
 """What holds an object with a box: is the box explained by the usual places of its class?
 
 Let b be the bottom of the box of an object above the floor, with the error s. Each place has a
-likelihood of b, per metre:
+likelihood of b, per metre (N: normal with the error s, or rarely 3 s):
 
     floor       N(b; 0, s)
     on or in j  overlap · [(1 - k) · N(b - top of j; 0, s) + k · U(b between bottom and top of j)]
@@ -51,6 +51,7 @@ _USUAL: Final = 0.2  # share q from which a supporter counts fully as usual
 _LEAST_WITHIN: Final = 0.1  # minimum of k
 _CARRIES: Final = 0.5  # footprint of a supporter, as a share of that on it, that carries fully
 _UNUSUAL: Final = 0.02  # weight of an unusual supporter in the choice of the anchor
+_LARGE, _RARE = 3.0, 0.03  # factor and share of large errors
 _LEAST: Final = 1e-6  # minimum of a likelihood
 _SQRT_2_PI: Final = math.sqrt(2.0 * math.pi)
 
@@ -132,8 +133,13 @@ def standing(
 
 @compiled
 def _normal(distance, s):
-    """Return the density per metre of a normal distance with the standard deviation s."""
-    return math.exp(-0.5 * (distance / s) ** 2) / (s * _SQRT_2_PI)
+    """Return the density per metre of a distance with the error s, rarely `_LARGE` times as large.
+
+    Detectors make large errors more often than a normal distribution does.
+    """
+    narrow = math.exp(-0.5 * (distance / s) ** 2)
+    wide = math.exp(-0.5 * (distance / (_LARGE * s)) ** 2) / _LARGE
+    return ((1.0 - _RARE) * narrow + _RARE * wide) / (s * _SQRT_2_PI)
 
 
 @compiled

@@ -151,6 +151,10 @@ def _parse_scene(line: bytes, default_id: str) -> AnnotatedScene:
     )
 
 
+# Errors of boxes, which a recorded request may state. Training takes its boxes as exact.
+_UNUSED: Final = frozenset({"position_std", "size_std"})
+
+
 def _objects(
     entries: Sequence[dict[str, Any]], counts: Mapping[str, int], conventions: Conventions
 ) -> tuple[AnnotatedObject, ...]:
@@ -171,7 +175,8 @@ def _objects(
                 name = f"{label}_{number}"
             ids.add(name)
         count = {"count": counts[label]} if label in counts else {}
-        complete.append(entry | {"id": name} | count)
+        known = {key: value for key, value in entry.items() if key not in _UNUSED}
+        complete.append(known | {"id": name} | count)
     for label in counts:
         if labels[label] != 1:
             raise ValueError(

@@ -57,6 +57,7 @@ from training.fit.regression import LEAST_SCENES, RIDGE, at_most, logistic
 
 _SCENES: Final = 250  # maximum scenes of a source
 _SOURCE_SCENES: Final = 60  # minimum scenes of a source with its own alarm line
+_OF_MOVED: Final = 0.25  # weight of a scene of boxes with an object at a wrong place
 _OF_WORDS: Final = 0.1  # weight of an altered on-top that is asked in the words "under"
 _LENGTHS: Final = (1, 2, 4, 8, 16, 32)  # numbers of entries to which the alarm lines are fitted
 # Share of the alarms that each kind of entry may raise, without boxes and with boxes.
@@ -123,6 +124,8 @@ def _cases(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int) -> _
             explained = listed_of_boxes | (entries.terms[:, 0] >= EXPLAINED)
             usable &= (entries.kind != OVER_IT) | ~explained
             weight = _OF_WORDS if wrong in bare.opposites else 1.0
+            if bare.has_boxes and wrong is not None:
+                weight = _OF_MOVED
             of_scene.append((number, encoded.source, wrong is None, shows_all, weight))
             of_entries.append((entries.kind[usable], entries.terms[usable], is_wrong[usable]))
     if not of_scene:
