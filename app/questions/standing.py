@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from app.compiling import compiled
 from app.scene.footprints import measure
-from app.scene.scene import MIN_OVERLAP, SMALLEST_STD, Boxes, normal_share
+from app.scene.scene import SMALLEST_STD, Boxes, normal_share, overlap_probability
 
 Indices = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -139,14 +139,10 @@ def _normal(distance, s):
 @compiled
 def _overlap(boxes, i, j):
     """Return the probability that the footprints of two boxes overlap by `MIN_OVERLAP`."""
-    points, extents, turns, errors = boxes
+    points, extents, turns, _ = boxes
     radius = math.hypot(extents[i, 0], extents[i, 1]) + math.hypot(extents[j, 0], extents[j, 1])
     distance = math.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1])
     if distance > radius / 2:
         return 0.0
     share, _ = measure(points[i], extents[i], turns[i], points[j], extents[j], turns[j])
-    if share <= 0.0:
-        return 0.0
-    side = math.sqrt(min(extents[i, 0] * extents[i, 1], extents[j, 0] * extents[j, 1]))
-    error = math.hypot(errors[i, 0], errors[j, 0])
-    return normal_share((share - MIN_OVERLAP) * side, error)
+    return overlap_probability(boxes, i, j, share) if share > 0.0 else 0.0
