@@ -302,9 +302,10 @@ def misplaced_fields(
     """Judge the stated relations, or the places of boxes.
 
     Every stated relation, and every support of boxes, of a kind that the model judges is listed,
-    without structure, and without stated stacks of one class. Other entries about boxes need at least `LEAST_LISTED`, or an alarm. The most
-    probably wrong entry comes first. Equal probabilities keep the order of
-    `Scene.triples`, or of the objects. An object under another object is the subject of its entry.
+    without structure, and without stated stacks of one class. Other entries about boxes need at
+    least `LEAST_LISTED`, or an alarm. The most probably wrong entry comes first. Equal
+    probabilities keep the order of `Scene.triples`, or of the objects. An object under another
+    object is the subject of its entry.
     `scene_client.schemas.MisplacedRelation` defines the fields.
     """
     entries = entries_of(model, posterior, scene)

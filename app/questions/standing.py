@@ -18,7 +18,8 @@ place is the log ratio
 
     t = log Σ wrong share · likelihood - log Σ usual share · likelihood
 
-So an object is at a wrong place only if no usual place explains its box within the errors.
+So an object is at a wrong place only if no usual place explains its box within the errors. A box
+that probably reaches into an object does not float.
 """
 
 import math
@@ -68,7 +69,7 @@ def standing(
     boxes: Boxes,
     floor: float,  # height in metres, or NaN: unknown
     shares: Float[NDArray, "N 3"],  # usual places of each object's class: floor, wall, support
-    supporters: Float[NDArray, "N N"],  # share q of object j's class among the supporters of i's
+    supporters: Float[NDArray, "N N"],  # share q of j's class for i's class; structure has 0
     unlisted: Float[NDArray, " N"],  # share of the supporters that the scene does not list
     within: Float[NDArray, " N"],  # share k of the things of each object far below its top
 ) -> tuple[Float[NDArray, " N"], Int[NDArray, " N"], Int[NDArray, " N"]]:
@@ -113,7 +114,7 @@ def standing(
             if likely > largest:
                 largest, anchor[i] = likely, j
             deep = overlap * normal_share(top - 2 * error - bottom, error) * inside
-            if deep > sunk:
+            if deep > sunk and supporters[i, j] > 0.0:
                 sunk, deepest = deep, j
         usual += shares[i, 2] * unlisted[i] * (1.0 - _BLOCKED * over) * unheld
         wrong = np.array(
@@ -122,6 +123,8 @@ def standing(
         for place in range(4):
             wrong[place] *= WRONG[place]
         reason[i] = wrong.argmax()
+        if reason[i] == FLOATS and sunk > 0.5:
+            reason[i] = SUNK
         if reason[i] == SUNK:
             anchor[i] = deepest
         elif reason[i] != ON_OBJECT:

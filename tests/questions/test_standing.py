@@ -123,6 +123,9 @@ WRONG_PLACES = [
     (("nightstand", 0, 0, 0.9), ("bed", 0, 0, 0), ON_OBJECT, 1),
     (("sofa", 0, 0, -0.4), ("table", 5, 0, 0), SUNK, -1),
     (("sofa", 0, 0, 0.75), ("table", 0, 0, 0), ON_OBJECT, 1),
+    # Things may be in a fridge, and hardly in a table.
+    (("washing machine", 0, 0, 0.4), ("fridge", 0, 0, 0), ON_OBJECT, 1),
+    (("fridge", 0, 0, 0.3), ("table", 0, 0, 0), SUNK, 1),
     (("table", 0, 0, 0.8), ("bed", 6, 0, 0), FLOATS, -1),
     (("pillow", 0, 0, 0.0), ("bed", 6, 0, 0), ON_FLOOR, -1),
     (("washing machine", 0, 0, 0.75), ("table", 0, 0, 0), ON_OBJECT, 1),
@@ -193,5 +196,3 @@ def test_boxes_without_a_position_are_not_judged():
     alone = judge(("cup", 0, 0, 0.75))
     assert at.log_ratio[0] == pytest.approx(alone.log_ratio[0], abs=0.8)
     assert at.anchor[0] == -1
-
-

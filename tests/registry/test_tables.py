@@ -71,7 +71,9 @@ def places(**changes: Any) -> Places:
 def possibility(**changes: Any) -> Possibility:
     """Descriptions of two classes, and none of the third one."""
     values = {
-        "stands": np.array([(1, 0, 0, 0, 0), (0.25, 0, 0.25, 0.5, 0), (0.25, 0.25, 0.25, 0.125, 0.125)], np.float32),
+        "stands": np.array(
+            [(1, 0, 0, 0, 0), (0.25, 0, 0.25, 0.5, 0), (0.25, 0.25, 0.25, 0.125, 0.125)], np.float32
+        ),
         "traits": np.array([(1, 0, 3), (0, 0.5, 1), (-1, -1, -1)], np.float32),
         "spread": np.array([0.25, 0.5, 0.25], np.float32),
         "weights": np.arange(16, dtype=np.float32).reshape(4, 4) / 8,

@@ -112,9 +112,7 @@ def test_the_overlap_and_the_direction_are_less_certain_with_a_larger_error():
     """The cup is over the edge with 60 % of its footprint, and a box is 30 cm to the left."""
     over_edge, beside = cup(0.0, y=0.79), ((2.0, 0.3, 0.5), (0.05, 0.05, 0.5))
     other = (2.0, 0.0, 0.5), (0.05, 0.05, 0.5)
-    on = [
-        probabilities(over_edge, TABLE, error=s, of_faces=0.0)[ON_TOP, 0, 1] for s in ERRORS
-    ]
+    on = [probabilities(over_edge, TABLE, error=s, of_faces=0.0)[ON_TOP, 0, 1] for s in ERRORS]
     left = [probabilities(beside, other, error=s)[LEFT, 0, 1] for s in ERRORS]
     for values in (on, left):
         assert values == sorted(values, reverse=True)

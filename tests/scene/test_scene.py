@@ -437,6 +437,16 @@ def test_every_convention_describes_the_same_box(
     assert same_turn(read[2], yaw)
 
 
+@pytest.mark.parametrize("units", sorted(METRES))
+def test_standard_deviations_have_the_units_of_positions_and_sizes(units):
+    """Half extents have half the error of full extents."""
+    metres = METRES[units]
+    assert Conventions(units=units).errors(0.5, 0.25) == (0.5 * metres, 0.25 * metres)
+    assert Conventions(units=units, extents="half").errors(0.5, 0.25)[1] == 0.5 * metres
+    assert Conventions(units=units).errors(None, 0.0) == (None, 0.0)
+    assert Conventions(units=units).errors(0.0, None) == (0.0, None)
+
+
 @pytest.mark.parametrize("up", ["z", "y"])
 def test_a_typical_size_leads_from_the_bottom_to_the_centre(up):
     place, size, _ = Conventions(up, "cm", box_origin="bottom").box(
