@@ -203,6 +203,15 @@ def test_stacks_of_one_class_are_not_judged(a, is_judged):
     assert len(entries(scene)) == is_judged
 
 
+def test_stacks_of_one_class_are_not_judged_by_their_boxes_either():
+    """A bin on a bin. The lower bin and the desk stand on the floor."""
+    things = posed((BIN, (0, 0, 0)), (BIN, (0, 0, 0.4)), (DESK, (9, 0, 0))).objects
+    things = tuple(replace(thing, id=str(k)) for k, thing in enumerate(things))
+    assert {i for _, i, _ in entries(observe(Scene(things)))} == {0, 2}
+    pot = replace(things[1], label="pot", class_index=POT)
+    assert {i for _, i, _ in entries(observe(Scene((things[0], pot, things[2]))))} == {0, 1, 2}
+
+
 def test_the_stand_of_classes_that_belong_everywhere_is_not_judged():
     """A bag under the desk, or on the floor, is normal. On the monitor, z decides alone."""
     objects = [replace(thing, anywhere=thing.label == "bin") for thing in VOCABULARY.objects]
