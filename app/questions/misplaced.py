@@ -224,7 +224,7 @@ def _stated(model: SceneModel, posterior: Posterior, scene: Scene) -> Iterator[_
 
 
 def _posed(model: SceneModel, posterior: Posterior, scene: Scene) -> Iterator[_Entry]:
-    """Yield the entry of each object with a box. A confirmed support has no other evidence."""
+    """Yield the entry of each object with a box, without stacks of one class."""
     if model.places is None:
         return
     evidence, holding = _Evidence(model, posterior), {*scene.triples}
@@ -238,6 +238,8 @@ def _posed(model: SceneModel, posterior: Posterior, scene: Scene) -> Iterator[_E
                 relation, kind, _ = _REASONS[reason]
                 yield relation, i, j, kind, 0.0, 0.0, -at.log_ratio[i], 0.0, 0.0, i
             continue
+        if evidence.classes[i] == evidence.classes[j]:
+            continue  # a stack of one class, as in `_stated`
         a = INSIDE if (INSIDE, i, j) in holding else ON_TOP
         (z, u), d, q = evidence.support(a, i, j), evidence.d(a, i, j), evidence.q(i, j)
         s = -at.log_ratio[i]
@@ -303,9 +305,10 @@ def misplaced_fields(
     """Judge the stated relations, or the places of boxes.
 
     Every stated relation, and every support of boxes, of a kind that the model judges is listed,
-    without structure. Other entries about boxes need at least `LEAST_LISTED`, or an alarm. The most
-    probably wrong entry comes first. Equal probabilities keep the order of
-    `Scene.triples`, or of the objects. An object under another object is the subject of its entry.
+    without structure and stacks of one class. Other entries about boxes need at least
+    `LEAST_LISTED`, or an alarm. The most probably wrong entry comes first. Equal probabilities keep
+    the order of `Scene.triples`, or of the objects. An object under another object is the subject
+    of its entry.
     `scene_client.schemas.MisplacedRelation` defines the fields.
     """
     entries = entries_of(model, posterior, scene)

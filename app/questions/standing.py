@@ -18,7 +18,8 @@ place is the log ratio
 
     t = log Σ wrong share · likelihood - log Σ usual share · likelihood
 
-So an object is at a wrong place only if no usual place explains its box within the errors.
+So an object is at a wrong place only if no usual place explains its box within the errors. A box
+that probably reaches into an object does not float.
 """
 
 import math
@@ -30,7 +31,7 @@ from numpy.typing import NDArray
 
 from app.compiling import compiled
 from app.scene.footprints import measure
-from app.scene.scene import MIN_OVERLAP, SMALLEST_STD, Boxes, normal_share
+from app.scene.scene import SMALLEST_STD, Boxes, normal_share, overlap_probability
 
 Indices = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -69,7 +70,7 @@ def standing(
     boxes: Boxes,
     floor: float,  # height in metres, or NaN: unknown
     shares: Float[NDArray, "N 3"],  # usual places of each object's class: floor, wall, support
-    supporters: Float[NDArray, "N N"],  # share q of object j's class among the supporters of i's
+    supporters: Float[NDArray, "N N"],  # share q of j's class for i's class; structure has 0
     unlisted: Float[NDArray, " N"],  # share of the supporters that the scene does not list
     within: Float[NDArray, " N"],  # share k of the things of each object far below its top
 ) -> tuple[Float[NDArray, " N"], Int[NDArray, " N"], Int[NDArray, " N"]]:
@@ -114,7 +115,7 @@ def standing(
             if likely > largest:
                 largest, anchor[i] = likely, j
             deep = overlap * normal_share(top - 2 * error - bottom, error) * inside
-            if deep > sunk:
+            if deep > sunk and supporters[i, j] > 0.0:
                 sunk, deepest = deep, j
         usual += shares[i, 2] * unlisted[i] * (1.0 - _BLOCKED * over) * unheld
         wrong = np.array(
@@ -123,6 +124,8 @@ def standing(
         for place in range(4):
             wrong[place] *= WRONG[place]
         reason[i] = wrong.argmax()
+        if reason[i] == FLOATS and sunk > 0.5:
+            reason[i] = SUNK
         if reason[i] == SUNK:
             anchor[i] = deepest
         elif reason[i] != ON_OBJECT:
@@ -145,14 +148,10 @@ def _normal(distance, s):
 @compiled
 def _overlap(boxes, i, j):
     """Return the probability that the footprints of two boxes overlap by `MIN_OVERLAP`."""
-    points, extents, turns, errors = boxes
+    points, extents, turns, _ = boxes
     radius = math.hypot(extents[i, 0], extents[i, 1]) + math.hypot(extents[j, 0], extents[j, 1])
     distance = math.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1])
     if distance > radius / 2:
         return 0.0
     share, _ = measure(points[i], extents[i], turns[i], points[j], extents[j], turns[j])
-    if share <= 0.0:
-        return 0.0
-    side = math.sqrt(min(extents[i, 0] * extents[i, 1], extents[j, 0] * extents[j, 1]))
-    error = math.hypot(errors[i, 0], errors[j, 0])
-    return normal_share((share - MIN_OVERLAP) * side, error)
+    return overlap_probability(boxes, i, j, share) if share > 0.0 else 0.0

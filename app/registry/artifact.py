@@ -18,12 +18,11 @@ from app.inference import MachineSpec, Weights
 from app.inference.objects import LARGEST_WEIGHT
 from app.inference.weights import layout
 from app.model import Counts, Offsets, Places, Possibility, SceneModel
-from app.model.fields import TensorGroup
 from app.registry.card import render_card
 from app.registry.description import Description
 from app.registry.durable import read_file, sync_directory, write_file
 from app.registry.errors import ArtifactError, cause
-from app.registry.manifest import CARD, MANIFEST, WEIGHTS, FileEntry, Manifest
+from app.registry.manifest import CARD, GROUPS, MANIFEST, WEIGHTS, FileEntry, Manifest
 from app.registry.tensors import StorageDtype, pack, read_group, require_equal, unpack
 from scene_client.schemas import ModelReference
 
@@ -34,7 +33,6 @@ MAX_WEIGHTS_BYTES: Final = 2**30
 """Default maximum size of the weights file in bytes."""
 
 _DTYPES: Final = {float: "float32", int: "int32"}
-_GROUPS: Final[tuple[type[TensorGroup], ...]] = (Offsets, Counts, Places, Possibility)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +128,7 @@ def _model(manifest: Manifest, tensors: dict[str, NDArray[Any]]) -> SceneModel:
     """Return the model of the tensors by name: its weights and its tables of statistics."""
     tables = [
         {name: tensors.pop(name) for name in list(tensors) if name.startswith(group.prefix)}
-        for group in _GROUPS
+        for group in GROUPS
     ]
     weights = _weights(manifest, tensors)
     sizes = weights.spec.A, weights.spec.V, len(manifest.vocabulary.room_types)

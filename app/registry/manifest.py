@@ -13,8 +13,8 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import Field, ValidationError, field_validator
 
-from app.model.fields import Count, Frozen, Many, Sha256, first_error, to_json
-from app.model.statistics import Counts, Offsets, Places
+from app.model import Counts, Offsets, Places, Possibility
+from app.model.fields import Count, Frozen, Many, Sha256, TensorGroup, first_error, to_json
 from app.registry.description import Description
 from app.registry.errors import ArtifactError, Code
 
@@ -23,6 +23,9 @@ MAX_TENSORS: Final = 10_000
 WEIGHTS: Final = "model.safetensors"
 CARD: Final = "card.md"
 MANIFEST: Final = "manifest.json"
+
+GROUPS: Final[tuple[type[TensorGroup], ...]] = (Offsets, Counts, Places, Possibility)
+"""The tables of a model beside the machine."""
 
 _TRAILER: Final = re.compile(rb',\n"checksum": "([0-9a-f]{64})"\n}\n\Z')
 
@@ -35,8 +38,8 @@ class TensorEntry(Frozen):
 
 
 def of_machine(tensors: Mapping[str, TensorEntry]) -> dict[str, TensorEntry]:
-    """Return the tensors of the machine, without offsets, counts and places."""
-    statistics = tuple(group.prefix for group in (Offsets, Counts, Places))
+    """Return the tensors of the machine, without those of `GROUPS`."""
+    statistics = tuple(group.prefix for group in GROUPS)
     return {name: entry for name, entry in tensors.items() if not name.startswith(statistics)}
 
 

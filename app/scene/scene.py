@@ -426,8 +426,7 @@ def _relate_all(
                 observed[relation, i, j] = observed[relation, j, i] = True
             error = math.hypot(errors[i, 0], errors[j, 0])
             if share > 0.0:
-                smaller = min(extents[i, 0] * extents[i, 1], extents[j, 0] * extents[j, 1])
-                overlap = normal_share((share - MIN_OVERLAP) * math.sqrt(smaller), error)
+                overlap = overlap_probability(boxes, i, j, share)
                 if overlap >= POSSIBLE:
                     stacked = _stack(boxes, i, j, overlap, classes, roles, probability, observed)
             if neighbours and horizontal and stacked < HOLDS:
@@ -453,6 +452,39 @@ def normal_share(margin, error):
 
 
 @compiled
+def overlap_probability(boxes: Boxes, i: int, j: int, share: float) -> float:
+    """Return the probability that the footprints of two boxes overlap by `MIN_OVERLAP`.
+
+    ``share`` is the overlap as a share of the smaller footprint. The margin is the shift by which
+    the overlap would become `MIN_OVERLAP`: also the way to the border, for a footprint within the
+    other one.
+    """
+    _, extents, turns, errors = boxes
+    smaller, larger = i, j
+    if extents[i, 0] * extents[i, 1] > extents[j, 0] * extents[j, 1]:
+        smaller, larger = j, i
+    margin = (share - MIN_OVERLAP) * math.sqrt(extents[smaller, 0] * extents[smaller, 1])
+    across, along = _offset(boxes, smaller, larger)
+    turn = turns[smaller] - turns[larger]
+    cos, sin = abs(math.cos(turn)), abs(math.sin(turn))
+    half_across = (cos * extents[smaller, 0] + sin * extents[smaller, 1]) / 2
+    half_along = (sin * extents[smaller, 0] + cos * extents[smaller, 1]) / 2
+    inner = min(
+        extents[larger, 0] / 2 - across - half_across, extents[larger, 1] / 2 - along - half_along
+    )
+    return normal_share(margin + max(inner, 0.0), math.hypot(errors[i, 0], errors[j, 0]))
+
+
+@compiled
+def _offset(boxes: Boxes, i: int, j: int) -> tuple[float, float]:
+    """Return the distances of two centres along the two horizontal axes of box j."""
+    points, _, turns, _ = boxes
+    dx, dy = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1]
+    cos, sin = math.cos(turns[j]), math.sin(turns[j])
+    return abs(cos * dx + sin * dy), abs(cos * dy - sin * dx)
+
+
+@compiled
 def contact_weights(lift: float, error: float) -> tuple[float, float, float]:
     """Return the weights of rule 1 for a lift in metres: touching, above, and reaching into."""
     s = max(error, SMALLEST_STD)
@@ -464,14 +496,12 @@ def contact_weights(lift: float, error: float) -> tuple[float, float, float]:
 @compiled
 def _carries(boxes: Boxes, subject: int, anchor: int) -> bool:
     """Return whether the anchor carries a box on it: a smaller one, or one centred over it."""
-    points, extents, turns, errors = boxes
+    _, extents, _, errors = boxes
     area = extents[anchor, 0] * extents[anchor, 1]
     if extents[subject, 0] * extents[subject, 1] <= area * (1.0 + SAME):
         return True
-    dx, dy = points[subject, 0] - points[anchor, 0], points[subject, 1] - points[anchor, 1]
-    cos, sin = math.cos(turns[anchor]), math.sin(turns[anchor])
     margin = math.hypot(errors[subject, 0], errors[anchor, 0])
-    across, along = abs(cos * dx + sin * dy), abs(cos * dy - sin * dx)
+    across, along = _offset(boxes, subject, anchor)
     return across <= extents[anchor, 0] / 2 + margin and along <= extents[anchor, 1] / 2 + margin
 
 

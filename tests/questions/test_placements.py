@@ -1,6 +1,5 @@
 """Placements of missing objects, and their offsets in metres."""
 
-import itertools
 import math
 from collections import namedtuple
 from dataclasses import replace
@@ -11,16 +10,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.special import expit, logit
+from scipy.special import expit
 
 from app.model import CountSlope, Offsets
 from app.model.calibration import PlaceFit
 from app.model.statistics import UNOBSERVED, offsets_of_missing, rotated
-from app.questions.placements import Place, place_log_p, placements
+from app.questions.placements import Place, place_log_p
 from app.questions.posterior import Posterior
 from app.scene import RELATIONS, ObjectClass, Scene, SceneObject, Vocabulary
 from app.scene.spatial_relations import ABOVE, CANONICAL, FRONT, INSIDE, LEFT, ON_TOP, canonicalise
-from app.scene.stands import HANGS, SUPPORTED
 from scene_client.frames import viewer_axes
 from tests.questions.answers import missing, without_minimums
 from tests.questions.artifacts import (
@@ -28,7 +26,6 @@ from tests.questions.artifacts import (
     LARGER,
     STRUCTURE,
     larger_artifact,
-    places_of,
     scene_of,
 )
 
@@ -77,7 +74,7 @@ ARTIFACT = larger_artifact("triway", placement=SLOPES)
 @pytest.mark.usefixtures("without_minimums")
 def test_no_place_is_under_an_object_on_top_of_another():
     def under(*stated):
-        entries = missing(ARTIFACT, scene_of([0, 1, 2], list(stated)), top_k=9)
+        entries = missing(ARTIFACT, scene_of([0, 1], list(stated)), top_k=9)
         places = [place for entry in entries for place in entry.placements]
         return {place.object for place in places if place.relation == "under"}
 
@@ -170,34 +167,6 @@ def test_placements_have_the_offsets_of_their_classes(name):
             assert place.offset == offset_of(relation, index, anchor, subject == "missing")
 
 
-SHOWN = {(ON_TOP, 1, 2): 2.0, (ON_TOP, 5, 2): 1.0, (INSIDE, 5, 6): 4.0}
-
-
-def test_relations_that_training_never_shows_are_lowered_by_the_stand_of_the_subject():
-    stands = np.random.default_rng(0).dirichlet([1, 1, 1], V)
-    stands[3] = (1.0, 0.0, 0.0)
-    improbable = (CountSlope(intercept=-9.0),) * A
-    bare = replace(larger_artifact("triway", placement=improbable), places=None)
-    places = places_of(V, SHOWN, stands=np.float32(stands))
-    stand_of = {ON_TOP: SUPPORTED, ABOVE: HANGS, INSIDE: SUPPORTED}
-
-    def log_odds(artifact, anchor, name):
-        scene = scene_of([anchor])
-        classes = np.array([k for k in range(V - 1) if k != anchor])
-        posterior, place = Posterior(artifact, scene), Place.of(name, 0)
-        found = placements(artifact, posterior, scene, classes, None, place)
-        return {k: logit(own[0]["probability"]) for k, own in zip(classes, found, strict=True)}
-
-    for name, anchor in itertools.product(RELATIONS, range(V - 1)):
-        before = log_odds(bare, anchor, name)
-        for missed, after in log_odds(replace(bare, places=places), anchor, name).items():
-            a, i, j = canonicalise(missed, name, anchor)
-            share = max(stands[i, stand_of[a]], 0.005) if a in stand_of else 1.0
-            is_shown = SHOWN.get((a, i, j), 0) >= 2
-            change = 0.0 if is_shown else min(math.log(share / 0.5), 0.0)
-            assert after - before[missed] == pytest.approx(change, abs=1e-4)
-
-
 @pytest.mark.usefixtures("without_minimums")
 def test_no_place_is_inside_an_object_that_is_too_small():
     sizes = {"sofa": (2.0, 0.9, 0.8), "vase": (0.1, 0.1, 0.3)}
@@ -215,6 +184,29 @@ def test_no_place_is_inside_an_object_that_is_too_small():
     assert first(sofa, vase).get("inside", 0) < 1e-6
     assert first(vase, sofa).get("contains", 0) < 1e-6
     assert first(sofa, chair)["inside"] > 1e-3
+
+
+@pytest.mark.usefixtures("without_minimums")
+def test_a_smaller_anchor_holds_nothing_and_is_not_looked_for_below_or_in_a_thing():
+    """A sofa is not on, in or under a vase, and no vase is on the sofa. It may be above a rug."""
+    sizes = {"sofa": (2.0, 0.9, 0.8), "vase": (0.1, 0.1, 0.3), "bed": (2.1, 2.0, 0.6)}
+    classes = [ObjectClass(label, size=sizes.get(label)) for label in LABELS[:V]]
+    vocabulary = Vocabulary(classes, ("bedroom", "office"))
+    sofa, vase, chair, bed = 4, 5, 3, 0
+    for a, name in ((ON_TOP, "on-top"), (ON_TOP, "under"), (ABOVE, "above"), (ABOVE, "below"),
+                    (INSIDE, "contains")):  # fmt: skip
+        likely = tuple(CountSlope(intercept=9.0 if k == a else -9.0) for k in range(A))
+        artifact = larger_artifact("triway-states", placement=likely)
+        artifact = replace(artifact, vocabulary=vocabulary, places=None)
+
+        def p(anchor, artifact=artifact, name=name):
+            (entry,) = missing(artifact, scene_of([anchor]), candidates=[sofa])
+            return {place.relation: place.probability for place in entry.placements}.get(name, 0)
+
+        is_listed = [p(anchor) > 1e-3 for anchor in (vase, bed, chair)]
+        # The size of the chair is unknown. A bed does not fit into a sofa.
+        expected = {"above": [True, True, True], "contains": [False, False, True]}
+        assert is_listed == expected.get(name, [False, True, True]), name
 
 
 module = import_module("app.questions.missing")  # the package has a function of this name

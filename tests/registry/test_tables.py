@@ -1,4 +1,4 @@
-"""Counts, offsets and places in an artifact: they are stored, checked, and looked up."""
+"""Tables of statistics in an artifact: they are stored, checked, and looked up."""
 
 from pathlib import Path
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.model import Counts, Offsets, Places
+from app.model import Counts, Offsets, Places, Possibility
 from app.model.fields import TensorGroup
 from app.registry import Artifact, ArtifactError, load_artifact, write_artifact
 from app.registry.manifest import of_machine
@@ -63,11 +63,25 @@ def places(**changes: Any) -> Places:
         "role_counts": np.array([(7, 1, 0), (0, 3, 0)], np.float32),
         "role_anchor": np.array([(7, 4, 0), (0, 0, 0), (0, 0, 0)], np.float32),
         "stands": np.array([(1, 0, 0), (0.25, 0.25, 0.5), (0.5, 0.5, 0)], np.float32),
+        "within": np.array([0.75, 0.125, 0], np.float32),
     }
     return Places(**(values | changes))
 
 
-GROUPS: tuple[Any, ...] = (counts, offsets, places)
+def possibility(**changes: Any) -> Possibility:
+    """Descriptions of two classes, and none of the third one."""
+    values = {
+        "stands": np.array(
+            [(1, 0, 0, 0, 0), (0.25, 0, 0.25, 0.5, 0), (0.25, 0.25, 0.25, 0.125, 0.125)], np.float32
+        ),
+        "traits": np.array([(1, 0, 3), (0, 0.5, 1), (-1, -1, -1)], np.float32),
+        "spread": np.array([0.25, 0.5, 0.25], np.float32),
+        "weights": np.arange(16, dtype=np.float32).reshape(4, 4) / 8,
+    }
+    return Possibility(**(values | changes))
+
+
+GROUPS: tuple[Any, ...] = (counts, offsets, places, possibility)
 
 
 def written(directory: Path, group: TensorGroup) -> Artifact:
@@ -76,12 +90,15 @@ def written(directory: Path, group: TensorGroup) -> Artifact:
     return load_artifact(directory)
 
 
+NAMES = [group.__name__ for group in GROUPS]
+
+
 @pytest.mark.parametrize("group", GROUPS)
 def test_a_group_comes_back_with_the_artifact(tmp_path: Path, group: Any) -> None:
     artifact = written(tmp_path / "a", group())
-    groups = {name: getattr(artifact.model, name) for name in ("counts", "offsets", "places")}
+    groups = {name: getattr(artifact.model, name) for name in NAMES}
     loaded = groups.pop(group.__name__)
-    assert [*groups.values()] == [None, None]
+    assert [*groups.values()] == [None] * 3
     for name, tensor in group().tensors().items():
         assert np.array_equal(loaded.tensors()[name], tensor)
     assert of_machine(artifact.manifest.tensors).keys() == state().keys()
@@ -130,7 +147,7 @@ INVALID: dict[tuple[Any, str], list[dict[str, Any]]] = {
     (offsets, "not_finite"): [{"relation": full(np.nan, A, 6)}],
     (places, "wrong_shape"): [
         *({"triple_scenes": full(0, 3)}, {"frequency": full(1, 2)}, {"role_counts": full(0, 2, 2)}),
-        *({"role_anchor": full(0, 2, 3)}, {"stands": full(0, V, 2)}),
+        *({"role_anchor": full(0, 2, 3)}, {"stands": full(0, V, 2)}, {"within": full(0, V, 1)}),
     ],
     (places, "invalid_tensor"): [
         *({"triple": np.array([1, *keys, 4], "i4")} for keys in ((3, 2), (2, 2))),
@@ -141,8 +158,20 @@ INVALID: dict[tuple[Any, str], list[dict[str, Any]]] = {
         {"frequency": np.array([0.5, 0, 0.1], "f4")},
         {"role_counts": np.array([(7, 1, 0), (0, -3, 0)], "f4")},
         *({name: full(-1, V, 3)} for name in ("role_anchor", "stands")),
+        {"within": full(-1, V)},
     ],
-    (places, "not_finite"): [{"stands": full(np.nan, V, 3)}],
+    (places, "not_finite"): [{"stands": full(np.nan, V, 3)}, {"within": full(np.inf, V)}],
+    (possibility, "wrong_shape"): [
+        *({"stands": full(0, V, 3)}, {"traits": full(0, 2, 3)}, {"weights": full(0, 4, 3)}),
+        *({"spread": full(1, V, 1)}, {"weights": full(0, 3, 4)}),
+    ],
+    (possibility, "invalid_tensor"): [
+        {"stands": full(-0.5, V, 5)},
+        {"traits": full(-2, V, 3)},
+        *({"spread": full(value, V)} for value in (0, -1)),
+        {"weights": full(-0.5, 4, 4)},  # no feature makes a place more possible
+    ],
+    (possibility, "not_finite"): [{"weights": full(np.nan, 4, 4)}],
 }
 
 
@@ -209,10 +238,10 @@ def test_the_ratio_of_a_place_is_that_of_smoothed_counts(relation, anchor, outgo
         assert ratio[i] == pytest.approx(np.log(p / FREQUENCY[i]), abs=1e-5)
 
 
-def test_two_scenes_show_a_relation() -> None:
-    for a in range(A):
-        expected = [[HELD.get((a, i, j), 0) >= 2 for j in range(V)] for i in range(V)]
-        assert places().shows(a, CLASSES, CLASSES).tolist() == expected
+def test_the_scenes_of_a_relation_are_those_of_its_triple() -> None:
+    expected = [[[HELD.get((a, i, j), 0) for j in CLASSES] for i in CLASSES] for a in range(A)]
+    assert places().scenes(range(A), CLASSES, CLASSES).tolist() == expected
+    assert places().scenes([ON_TOP], np.array([1]), np.array([2, 0])).tolist() == [[[2, 9]]]
 
 
 def test_supporters_are_smoothed_counts_of_on_top_and_inside() -> None:
@@ -239,6 +268,10 @@ def test_the_roles_tell_under_from_on() -> None:
     assert table.means_under(0, 2)
     assert not table.means_under(0, 1)  # one scene may be an error
     assert not table.means_under(2, 0)
+    # "Class 0 on top of class 2" is never said in these words, and "1 on top of 0" always.
+    assert table.literal_share(0, 2) == pytest.approx(0.5 / 3.5)
+    assert table.literal_share(1, 0) == 1
+    assert table.literal_share(0, 1) == pytest.approx(0.5 / 1.5)
     # Two scenes suffice, unless as many show the upper class on the lower.
     two, pairs = np.array([(2, 0, 0), (7, 1, 0), (0, 2, 0)], "f4"), np.array([2, 3, 6], "i4")
     assert places(role_counts=two[1:], role_pair=pairs[1:]).means_under(0, 2)

@@ -231,17 +231,54 @@ def stands(*boxes: Box, floor: float = 0.0) -> list[int]:
 def test_the_floor_is_where_most_objects_on_the_floor_stand() -> None:
     """One object far below, such as an error of the camera, does not move the floor."""
     bottoms = np.array([0.02, -3.0, 0.0, 0.75, 0.01, 1.8])
-    weights = np.array([0.9, 0.9, 0.9, 0.1, 0.8, 0.0])
-    assert floor_level(bottoms, weights) == pytest.approx(0.0, abs=0.03)
-    assert floor_level(bottoms + 7, weights) == pytest.approx(7.0, abs=0.03)
+    shares, errors = np.array([0.9, 0.9, 0.9, 0.1, 0.8, 0.0]), np.full(6, 0.05)
+    assert floor_level(bottoms, shares, errors) == pytest.approx(0.0, abs=0.03)
+    assert floor_level(bottoms + 7, shares, errors) == pytest.approx(7.0, abs=0.03)
+
+
+def test_the_likelihood_of_a_floor_is_that_of_a_hand_computation() -> None:
+    """A shelf at 0 with an error of 5 cm, and a pot at .4 m: the pot is on something.
+
+    At .4 m, the shelf would reach below the floor, which only an error explains.
+    """
+    bottoms, shares, errors = np.array([0.0, 0.4]), np.array([0.6, 0.55]), np.array([0.05, 0.05])
+    peak = 1 / (0.05 * math.sqrt(2 * math.pi))
+    low = math.log(0.6 * peak + 0.4 * (0.4 + 0.05)) + math.log(0.4 * (0.45 + 0.05))
+    high = math.log(0.4 * 0.05) + math.log(0.55 * peak + 0.4 * (0.45 + 0.05))
+    assert low > high
+    assert floor_level(bottoms, shares, errors) == 0.0
+    # A shelf that hardly ever stands on the floor is no candidate.
+    shares[0] = 0.49
+    assert floor_level(bottoms, shares, errors) == 0.4
+
+
+def test_a_certain_box_outweighs_an_uncertain_one() -> None:
+    """The error of the first box is 20 cm, so it may stand on the floor of the second one."""
+    bottoms, shares = np.array([-0.2, 0.0]), np.array([0.9, 0.9])
+    assert floor_level(bottoms, shares, np.array([0.2, 0.02])) == 0.0
+    assert floor_level(bottoms, shares, np.array([0.02, 0.2])) == -0.2
+
+
+floors = st.lists(
+    st.tuples(st.floats(-1, 2), st.floats(0, 1), st.floats(0, 0.3)), min_size=1, max_size=6
+)
+
+
+@given(floors)
+def test_the_floor_is_the_bottom_of_a_candidate(boxes):
+    bottoms, shares, errors = np.array(boxes).T.copy()
+    level = floor_level(bottoms, shares, errors)
+    candidates = bottoms[shares >= 0.5]
+    assert level in candidates if len(candidates) else math.isnan(level)
 
 
 def test_the_floor_is_unknown_without_objects_that_stand_on_it() -> None:
-    assert math.isnan(floor_level(np.array([NAN, 0.5]), np.array([1.0, 0.0])))
-    assert math.isnan(floor_level(np.zeros(0), np.zeros(0)))
+    bottoms, errors = np.array([NAN, 0.5]), np.full(2, 0.05)
+    assert math.isnan(floor_level(bottoms, np.array([1.0, 0.0]), errors))
+    assert math.isnan(floor_level(np.zeros(0), np.zeros(0), np.zeros(0)))
     # A cup tells nothing about the floor.
-    assert math.isnan(floor_level(np.array([NAN, 0.5]), np.array([1.0, 0.2])))
-    assert floor_level(np.array([NAN, 0.5]), np.array([1.0, 0.6])) == 0.5
+    assert math.isnan(floor_level(bottoms, np.array([1.0, 0.2]), errors))
+    assert floor_level(bottoms, np.array([1.0, 0.6]), errors) == 0.5
 
 
 def lamp(x: float, bottom: float) -> Box:
@@ -356,10 +393,10 @@ def test_viewer_axes_invert_the_conversion_to_the_viewer(yaw, up, point):
     assert told == pytest.approx(point, abs=1e-9)
 
 
-def test_a_viewer_without_a_direction_knows_only_what_is_up():
-    unknown = (0.0, 0.0, 0.0)
-    assert viewer_axes("map") == (unknown, unknown, (0.0, 0.0, 1.0))
-    assert viewer_axes("map", up="y") == (unknown, unknown, (0.0, 1.0, 0.0))
+@pytest.mark.parametrize("frame", ["map", "base_link", None])
+def test_a_viewer_without_a_direction_looks_along_the_first_axis(frame):
+    assert viewer_axes(frame) == ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    assert viewer_axes(frame, up="y") == ((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 
 
 # A frame with y up: x right, y up, z towards the viewer.
@@ -398,6 +435,16 @@ def test_every_convention_describes_the_same_box(
     assert read[0] == pytest.approx(centre, abs=1e-9)
     assert read[1] == pytest.approx(size)
     assert same_turn(read[2], yaw)
+
+
+@pytest.mark.parametrize("units", sorted(METRES))
+def test_standard_deviations_have_the_units_of_positions_and_sizes(units):
+    """Half extents have half the error of full extents."""
+    metres = METRES[units]
+    assert Conventions(units=units).errors(0.5, 0.25) == (0.5 * metres, 0.25 * metres)
+    assert Conventions(units=units, extents="half").errors(0.5, 0.25)[1] == 0.5 * metres
+    assert Conventions(units=units).errors(None, 0.0) == (None, 0.0)
+    assert Conventions(units=units).errors(0.0, None) == (0.0, None)
 
 
 @pytest.mark.parametrize("up", ["z", "y"])

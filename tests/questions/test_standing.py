@@ -1,0 +1,198 @@
+"""The evidence of boxes that an object is at a wrong place, and the reason."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.questions.standing import (
+    FLOATS,
+    HUNG,
+    HUNG_STD,
+    ON_FLOOR,
+    ON_OBJECT,
+    ROOM,
+    SUNK,
+    WRONG,
+    Standing,
+    standing,
+)
+
+# Size in metres; shares of the floor, of the wall and of supports; usual supporters; share k of the
+# things far below the top. The rest of the supporters is not in the scene.
+THINGS = {
+    "bed": ((1.6, 2.1, 0.9), (0.97, 0.01, 0.02), {}, 0.6),
+    "chandelier": ((0.8, 0.8, 0.5), (0.01, 0.98, 0.01), {}, 0.0),
+    "cup": ((0.08, 0.08, 0.1), (0.005, 0.015, 0.98), {"table": 0.5, "shelf": 0.1}, 0.0),
+    "curtain": ((2.0, 0.15, 2.2), (0.02, 0.96, 0.02), {}, 0.0),
+    "fridge": ((0.7, 0.7, 1.8), (0.97, 0.01, 0.02), {}, 0.9),
+    "laundry basket": ((0.45, 0.45, 0.6), (0.7, 0.01, 0.29), {"washing machine": 0.6}, 0.8),
+    "nightstand": ((0.5, 0.4, 0.5), (0.97, 0.01, 0.02), {}, 0.3),
+    "pillow": ((0.6, 0.4, 0.15), (0.03, 0.01, 0.96), {"bed": 0.8, "sofa": 0.15}, 0.0),
+    "shelf": ((0.9, 0.3, 1.8), (0.8, 0.18, 0.02), {}, 0.9),
+    "sofa": ((2.0, 0.9, 0.8), (0.98, 0.0, 0.02), {}, 0.7),
+    "table": ((1.6, 0.8, 0.75), (0.96, 0.01, 0.03), {}, 0.1),
+    "umbrella": ((0.15, 0.15, 0.9), (0.4, 0.3, 0.3), {}, 0.0),
+    "washing machine": ((0.6, 0.6, 0.85), (0.97, 0.01, 0.02), {}, 0.5),
+    "window": ((1.4, 0.1, 1.2), (0.0, 1.0, 0.0), {}, 0.0),
+}
+ERROR = 0.05
+
+
+def judge(*placed, floor=0.0, error=ERROR):
+    """The fields of `Standing` of (label, centre x, y, and height of the bottom)."""
+    rows = [THINGS[label] for label, *_ in placed]
+    sizes = np.array([row[0] for row in rows], float)
+    centres = np.array([place for _, *place in placed], float)
+    centres[:, 2] += sizes[:, 2] / 2
+    errors = np.column_stack([np.full(len(rows), error), np.hypot(error, sizes[:, 2] * error)])
+    supporters = np.array([[row[2].get(label, 0.01) for label, *_ in placed] for row in rows])
+    known = [sum(row[2].get(label, 0.0) for label in {p[0] for p in placed}) for row in rows]
+    return Standing(
+        *standing(
+            (centres, sizes, np.zeros(len(rows)), errors),
+            floor,
+            np.array([row[1] for row in rows]),
+            supporters,
+            1.0 - np.array(known),
+            np.array([row[3] for row in rows]),
+        )
+    )
+
+
+def normal(distance, s):
+    return math.exp(-0.5 * (distance / s) ** 2) / (s * math.sqrt(2 * math.pi))
+
+
+def share(margin, s):
+    return 0.5 * (1 + math.erf(margin / s / math.sqrt(2)))
+
+
+@pytest.mark.parametrize("bottom", [0.0, 0.05, 0.3, 1.2])
+def test_a_box_alone_is_that_of_a_hand_computation(bottom):
+    """An umbrella above the floor: on the floor, on the wall, or on an unlisted object."""
+    at, s = judge(("umbrella", 0, 0, bottom)), math.hypot(ERROR, 0.9 * ERROR)
+    on_floor, below = normal(bottom, s), share(-2 * s - bottom, s)
+    lifted = share(bottom - 0.2, s) / ROOM
+    hung = lifted / 2 + normal(bottom + 0.9 - HUNG, HUNG_STD) / 2
+    usual = 0.4 * on_floor + 0.3 * hung + 0.3 * lifted * share(2.0 - bottom, s)
+    places = on_floor, 0.0, (1 - below) / ROOM, below / ROOM
+    wrong = [part * place for part, place in zip(WRONG, places, strict=True)]
+    assert at.log_ratio == pytest.approx([math.log(sum(wrong) / usual)])
+    assert at.reason == [int(np.argmax(wrong))]
+    assert at.anchor == [-1]
+
+
+@pytest.mark.parametrize("lift", [0.0, 0.08, -0.05])
+def test_a_box_on_another_is_that_of_a_hand_computation(lift):
+    """A cup in the middle of a table, which carries it, and holds some things lower."""
+    at = judge(("table", 0, 0, 0), ("cup", 0, 0, 0.75 + lift))
+    s, of_table = math.hypot(ERROR, 0.1 * ERROR), math.hypot(ERROR, 0.75 * ERROR)
+    error, bottom = math.hypot(s, of_table), 0.75 + lift
+    inside = share(-lift, error) * share(bottom, error)
+    density = 0.9 * normal(lift, error) + 0.1 * inside / 0.75
+    on_floor, lifted = normal(bottom, s), share(bottom - 0.2, s) / ROOM
+    hung = lifted / 2 + normal(bottom + 0.1 - HUNG, HUNG_STD) / 2
+    blocked = 1 - 0.8 * share(lift - 0.2, error)
+    unlisted = 0.5 * blocked * lifted * share(2.0 - bottom, s)
+    usual = 0.005 * on_floor + 0.015 * hung + 0.98 * (0.5 * density + unlisted)
+    sunk = share(-2 * error - lift, error) * inside
+    wrong = np.array(WRONG) * [on_floor, density, 1 / ROOM, sunk / ROOM]
+    assert at.log_ratio[1] == pytest.approx(math.log(wrong.sum() / usual), abs=1e-5)
+    assert (at.reason[1], at.anchor[1]) == (ON_OBJECT, 0)
+
+
+RIGHT = [
+    # The curtain reaches the floor, and the window is behind it.
+    (("window", 0, 0, 0.9), ("curtain", 0, 0.05, 0.02)),
+    (("chandelier", 0, 0, 1.9), ("table", 0, 0, 0)),
+    (("umbrella", 3, 0, 0.0), ("table", 0, 0, 0)),
+    (("laundry basket", 3, 0, 0.0), ("table", 0, 0, 0)),
+    (("laundry basket", 0, 0, 0.85), ("washing machine", 0, 0, 0)),
+    (("fridge", 0, 0, 0.05), ("table", 3, 0, 0)),
+    (("pillow", 0, 0.7, 0.55), ("bed", 0, 0, 0)),  # in front of the headboard
+    (("cup", 0, 0, 1.1), ("shelf", 0, 0, 0)),  # on a board
+    (("cup", 3, 0, 0.9), ("table", 0, 0, 0)),  # on a worktop that nobody lists
+    (("cup", 0.3, 0, 0.8), ("table", 0, 0, 0)),
+]
+WRONG_PLACES = [
+    (("cup", 0, 0, 1.4), ("table", 0, 0, 0), FLOATS, -1),
+    (("cup", 3, 0, 0.0), ("table", 0, 0, 0), ON_FLOOR, -1),
+    (("nightstand", 0, 0, 0.9), ("bed", 0, 0, 0), ON_OBJECT, 1),
+    (("sofa", 0, 0, -0.4), ("table", 5, 0, 0), SUNK, -1),
+    (("sofa", 0, 0, 0.75), ("table", 0, 0, 0), ON_OBJECT, 1),
+    # Things may be in a fridge, and hardly in a table.
+    (("washing machine", 0, 0, 0.4), ("fridge", 0, 0, 0), ON_OBJECT, 1),
+    (("fridge", 0, 0, 0.3), ("table", 0, 0, 0), SUNK, 1),
+    (("table", 0, 0, 0.8), ("bed", 6, 0, 0), FLOATS, -1),
+    (("pillow", 0, 0, 0.0), ("bed", 6, 0, 0), ON_FLOOR, -1),
+    (("washing machine", 0, 0, 0.75), ("table", 0, 0, 0), ON_OBJECT, 1),
+]
+"""Each first object is at a wrong place: the reason, and the anchor."""
+
+
+@pytest.mark.parametrize("placed", RIGHT, ids=lambda placed: placed[0][0])
+def test_usual_places_are_not_wrong(placed):
+    at = judge(*placed)
+    assert at.log_ratio.max() < 1.0
+
+
+@pytest.mark.parametrize(("thing", "other", "reason", "anchor"), WRONG_PLACES)
+def test_wrong_places_and_their_reasons(thing, other, reason, anchor):
+    at = judge(thing, other)
+    assert at.log_ratio[0] > 0.5
+    assert (at.reason[0], at.anchor[0]) == (reason, anchor)
+    assert at.log_ratio[1] < 0.0
+
+
+@pytest.mark.parametrize("reason", [ON_FLOOR, ON_OBJECT, FLOATS])
+def test_wrong_places_have_more_evidence_than_usual_ones_of_the_same_reason(reason):
+    """Each reason has a judgement of its own."""
+    judged = [judge(*placed) for placed in RIGHT]
+    right = max(at.log_ratio[at.reason == reason].max(initial=-math.inf) for at in judged)
+    wrong = min(judge(*row[:2]).log_ratio[0] for row in WRONG_PLACES if row[2] == reason)
+    assert wrong > right + 1.0
+
+
+@given(st.sampled_from(RIGHT), st.floats(-20, 20), st.floats(-2, 2))
+def test_only_differences_of_positions_matter(placed, x, z):
+    moved = [(label, a + x, b - x, c + z) for label, a, b, c in placed]
+    one, two = judge(*placed), judge(*moved, floor=z)
+    assert one.log_ratio == pytest.approx(two.log_ratio, abs=1e-6)
+    assert one.reason.tolist() == two.reason.tolist()
+
+
+@pytest.mark.parametrize("error", [0.02, 0.05, 0.1])
+def test_a_higher_box_over_the_table_floats_more(error):
+    """A cup more than 20 cm over its usual supporter is hardly on an unlisted object."""
+    lifts = np.linspace(0.2, 0.6, 9)
+    t = [
+        judge(("cup", 0, 0, 0.75 + lift), ("table", 0, 0, 0), error=error).log_ratio[0]
+        for lift in lifts
+    ]
+    assert np.diff(t).min() > -0.05  # some things at this height hang on a wall
+    assert t[-1] > t[0] + 0.5
+
+
+def test_an_error_explains_a_gap():
+    lifted = ("fridge", 0, 0, 0.2), ("table", 3, 0, 0)
+    t = [judge(*lifted, error=error).log_ratio[0] for error in (0.02, 0.05, 0.1)]
+    assert t == sorted(t, reverse=True)
+    assert t[0] > 2 > 0 > t[-1]
+
+
+def test_without_a_floor_a_box_is_on_an_object_or_unheld():
+    """Nothing is known about the floor, so nothing is on the floor or below it."""
+    at = judge(("cup", 0, 0, 0.75), ("table", 0, 0, 0), ("sofa", 9, 0, -3), floor=math.nan)
+    assert at.reason.tolist() == [ON_OBJECT, FLOATS, FLOATS]
+    assert at.log_ratio[0] < 0
+
+
+def test_boxes_without_a_position_are_not_judged():
+    at = judge(("cup", 0, 0, 0.75), ("table", math.nan, 0, math.nan))
+    assert (at.reason[1], at.anchor[1], at.log_ratio[1]) == (-1, -1, 0.0)
+    alone = judge(("cup", 0, 0, 0.75))
+    assert at.log_ratio[0] == pytest.approx(alone.log_ratio[0], abs=0.8)
+    assert at.anchor[0] == -1
