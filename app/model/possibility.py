@@ -177,8 +177,8 @@ def _log_prior(weights, place, thing, other):
 
 
 def known_share(scenes: Float[NDArray[np.floating], "..."]) -> Float[NDArray[np.floating], "..."]:
-    """Return k = n / (n + 2) for relations that n training scenes show."""
-    return scenes / (scenes + _SCENES)
+    """Return k = n / (n + 2) for relations that n training scenes show: 1 for inf."""
+    return 1.0 - _SCENES / (scenes + _SCENES)
 
 
 class UnitsWithPrior(RelationUnits):

@@ -46,9 +46,8 @@ NO_ALARM = lines(1e3, 1e3, 1e3)
 
 def judging(lines: AlarmLines = NO_ALARM, stand: float = 0.0, **changes: object) -> Misplaced:
     """The judgement of every kind by the log-odds of the relation. Changes replace judgements."""
-    judgement = Judgement(
-        intercept=0.0, relation=-1.0, change=-1.0, stand=stand, supporter=0.0, lines=lines
-    )
+    weights = {"relation": -1.0, "change": -1.0, "stand": stand, "unknown": -1.0}
+    judgement = Judgement(intercept=0.0, supporter=0.0, entries=0.0, lines=lines, **weights)
     return Misplaced(**{**dict.fromkeys(KINDS, judgement), **changes})
 
 
@@ -69,6 +68,7 @@ def places_of(V: int, triples: dict[tuple[int, int, int], float], **changes: np.
         "role_counts": np.zeros((0, 3), np.float32),
         "role_anchor": np.zeros((V, 3), np.float32),
         "stands": np.full((V, 3), 1 / 3, np.float32),
+        "within": np.zeros(V, np.float32),
     }
     return Places(**{**arrays, **changes})
 

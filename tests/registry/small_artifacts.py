@@ -45,7 +45,10 @@ PROFILES = {"rbm": (), "gbm": (), "triway": ("homes", "shops")}
 
 EVEN = AlarmLine(intercept=0.0)
 HALF = AlarmLines(low=EVEN, medium=EVEN, high=EVEN)
-WRONG = Judgement(intercept=0.0, relation=-1.0, change=-1.0, stand=-1.0, supporter=-1.0, lines=HALF)
+WRONG = Judgement(
+    intercept=0.0, relation=-1.0, change=-1.0, stand=-1.0, supporter=-1.0, unknown=0.0, entries=0.0,
+    lines=HALF,
+)  # fmt: skip
 JUDGING = {
     "outlier": CountSlope(slope=-1.0),
     "outlier_lines": HALF,

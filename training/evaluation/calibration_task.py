@@ -98,8 +98,14 @@ def uncalibrated(artifact: SceneModel) -> SceneModel:
     """
     lines = AlarmLines(low=_NO_ALARM, medium=_NO_ALARM, high=_NO_ALARM)
     plain = Judgement(
-        intercept=0.0, relation=-1.0, change=-1.0, stand=0.0, supporter=0.0, unknown=-1.0,
-        entries=0.0, lines=lines,
+        intercept=0.0,
+        relation=-1.0,
+        change=-1.0,
+        stand=0.0,
+        supporter=0.0,
+        unknown=-1.0,
+        entries=0.0,
+        lines=lines,
     )
     neutral = Calibration.neutral(artifact.spec.A).model_copy(
         update={
