@@ -15,7 +15,7 @@ from app import questions
 from app.model import Counts
 from app.questions import QUESTIONS
 from app.scene import RelationTable, Scene, SceneObject
-from scene_client.frames import viewer_axes
+from scene_client.frames import is_world_fixed, viewer_axes
 from tests.http.stores import PROFILES, VOCABULARY, C, V, publish
 from tests.http.test_problems import problem
 from tests.questions.test_placements import offsets_of_every_pair
@@ -261,11 +261,12 @@ async def test_offsets_are_in_the_axes_of_the_frame(measured, frame, viewpoint, 
     )
     model = measured.app.state.runtime.models.served["measured", "1.0.0"].model
     scene = Scene(tuple(things), RelationTable.stated(()))
-    expected = questions.missing(model, scene, top_k=11, axes=axes)
+    has_viewer = viewpoint is not None or not is_world_fixed(frame)
+    expected = questions.missing(model, scene, top_k=11, axes=axes, has_viewer=has_viewer)
     assert answer["missing"] == expected["missing"]
     places = [place for entry in answer["missing"] for place in entry["placements"]]
     kinds = {"offset" in place for place in places}
-    assert kinds == ({True, False} if not any(axes[0]) else {True})
+    assert kinds == ({True} if has_viewer else {True, False})
 
 
 CONVENTIONS = {"up": "y", "units": "cm", "extents": "half", "box_origin": "bottom"}
