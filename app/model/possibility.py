@@ -241,7 +241,9 @@ def _add_prior(
                 if a == ON_TOP:
                     on = _log_prior(weights, ON, rows[x], rows[y])
                     under = _SAID + _log_prior(weights, UNDER, rows[y], rows[x])
-                    c = min(math.log(math.exp(on) + math.exp(under)), 0.0)
+                    larger = max(on, under)  # subtracted, because exp may be 0
+                    c = larger + math.log(math.exp(on - larger) + math.exp(under - larger))
+                    c = min(c, 0.0)
                 else:
                     c = _log_prior(weights, OVER if a == ABOVE else IN, rows[x], rows[y])
                 found = find_row(triple, (a * V + x) * V + y)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from app.model import AlarmLine, AlarmLines, Calibration, CountSlope, Judgement, Misplaced
-from app.model.calibration import KINDS
+from app.model.calibration import KINDS, WEIGHTS
 from app.registry import (
     AliasTarget,
     Artifact,
@@ -45,10 +45,7 @@ PROFILES = {"rbm": (), "gbm": (), "triway": ("homes", "shops")}
 
 EVEN = AlarmLine(intercept=0.0)
 HALF = AlarmLines(low=EVEN, medium=EVEN, high=EVEN)
-WRONG = Judgement(
-    intercept=0.0, relation=-1.0, change=-1.0, stand=-1.0, supporter=-1.0, unknown=0.0, entries=0.0,
-    lines=HALF,
-)  # fmt: skip
+WRONG = Judgement(intercept=0.0, lines=HALF, **dict.fromkeys(WEIGHTS, -1.0))
 JUDGING = {
     "outlier": CountSlope(slope=-1.0),
     "outlier_lines": HALF,
