@@ -44,7 +44,7 @@ from app.inference.relation_units import (
     relation_units,
 )
 from app.inference.weights import Weights, unpack_scenes
-from app.scene.relation_table import HOLDS
+from app.scene.spatial_relations import HOLDS
 
 Bits = UInt8[NDArray, " V"]
 """Presence of each class."""

@@ -27,7 +27,7 @@ from app.compiling import compiled, compiled_in_any_order
 from app.inference.elementary import to_log_odds
 from app.inference.implications import implication_shifts
 from app.inference.weights import Weights, state_means
-from app.scene.relation_table import HOLDS
+from app.scene.spatial_relations import HOLDS
 
 Means = Float[NDArray, "B H1"]
 """B different means of h1."""

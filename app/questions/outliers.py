@@ -290,7 +290,7 @@ _EXAMPLE_ANSWER: Final = {
     ],
     "misplaced": [{
         "subject": "lamp_1", "relation": "on-top", "object": "nightstand_1", "probability": 0.05,
-        "is_misplaced": False, "moved": "lamp_1",
+        "is_misplaced": False, "reason": "relation", "moved": "lamp_1",
     }],
 }  # fmt: skip
 

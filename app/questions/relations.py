@@ -26,11 +26,11 @@ from app.questions.placements import supported_objects
 from app.questions.posterior import Posterior, Present, exclusive, relation_probability
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
 from app.questions.reading import Reading
-from app.scene.relation_table import POSSIBLE
 from app.scene.scene import Scene
 from app.scene.spatial_relations import (
     CANONICAL,
     ON_TOP,
+    POSSIBLE,
     SUPPORTS,
     canonicalise,
     opposite,

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int
 from numpy.typing import NDArray
 
-from app.scene.spatial_relations import CANONICAL
+from app.scene.spatial_relations import CANONICAL, HOLDS
 
 Array: TypeAlias = NDArray[Any]
 Triple: TypeAlias = tuple[int, int, int]
@@ -24,9 +24,6 @@ STATED, BOXES, EXCLUDED = range(3)
 """Origins of a row. The first two are observations: the request states the relation or that it does
 not hold, or the boxes show this. A row of origin `EXCLUDED` observes nothing about other relations:
 its relation alone cannot hold between these boxes."""
-
-HOLDS: Final = 0.5  # minimum probability of a relation that holds
-POSSIBLE: Final = 0.01  # minimum probability of a relation that the boxes do not exclude
 
 _A: Final = len(CANONICAL)
 _COLUMNS: Final = ("relation", "subject", "object", "probability", "origin", "is_opposite")

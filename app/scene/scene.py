@@ -69,9 +69,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from app.compiling import compiled, inlined
 from app.scene.footprints import measure
-from app.scene.relation_table import EXCLUDED, HOLDS, POSSIBLE, RelationTable, Triple
+from app.scene.relation_table import EXCLUDED, RelationTable, Triple
 from app.scene.roles import IN, ON, SAME, UNDER, RoleCounts, is_smaller, likely_role, possible_roles
-from app.scene.spatial_relations import ABOVE, CANONICAL, FRONT, INSIDE, LEFT, ON_TOP
+from app.scene.spatial_relations import (
+    ABOVE,
+    CANONICAL,
+    FRONT,
+    HOLDS,
+    INSIDE,
+    LEFT,
+    ON_TOP,
+    POSSIBLE,
+)
 
 MIN_OVERLAP: Final = 0.30  # minimum overlap as a share of the smaller footprint
 CONTACT: Final = 0.05  # maximum lift in metres at which two boxes without errors touch

@@ -31,6 +31,9 @@ VERTICAL: Final = (ON_TOP, ABOVE)  # of an object to an object under it
 SUPPORTS: Final = (ON_TOP, INSIDE)  # of an object to the object that it stands on or in
 STACKED: Final = (ON_TOP, ABOVE, INSIDE)  # of two objects with overlapping footprints
 
+HOLDS: Final = 0.5  # minimum probability of a relation that holds
+POSSIBLE: Final = 0.01  # minimum probability of a relation that boxes do not exclude
+
 _NUMBER: Final = {name: number for number, name in enumerate(RELATIONS)}
 
 

@@ -15,7 +15,7 @@ from app import questions
 from app.model import Counts
 from app.questions import QUESTIONS
 from app.scene import RelationTable, Scene, SceneObject
-from scene_client.frames import viewer_axes
+from scene_client.frames import is_world_fixed, viewer_axes
 from tests.http.stores import PROFILES, VOCABULARY, C, V, publish
 from tests.http.test_problems import problem
 from tests.questions.test_placements import offsets_of_every_pair
@@ -261,11 +261,12 @@ async def test_offsets_are_in_the_axes_of_the_frame(measured, frame, viewpoint, 
     )
     model = measured.app.state.runtime.models.served["measured", "1.0.0"].model
     scene = Scene(tuple(things), RelationTable.stated(()))
-    expected = questions.missing(model, scene, top_k=11, axes=axes)
+    has_viewer = viewpoint is not None or not is_world_fixed(frame)
+    expected = questions.missing(model, scene, top_k=11, axes=axes, has_viewer=has_viewer)
     assert answer["missing"] == expected["missing"]
     places = [place for entry in answer["missing"] for place in entry["placements"]]
     kinds = {"offset" in place for place in places}
-    assert kinds == ({True, False} if not any(axes[0]) else {True})
+    assert kinds == ({True} if has_viewer else {True, False})
 
 
 CONVENTIONS = {"up": "y", "units": "cm", "extents": "half", "box_origin": "bottom"}
@@ -277,9 +278,11 @@ async def test_a_scene_in_other_conventions_has_the_same_answer(measured, questi
     boxes = (("desk", (2.0, 0.5, 0.4), (0.7, 1.4, 0.8)), ("lamp", (2.0, 0.8, 1.0), (0.2, 0.3, 0.4)))
     plain, other = [], []
     for label, (x, y, z), (a, b, c) in boxes:
-        plain.append({"label": label, "position": [x, y, z], "size": [a, b, c], "yaw": 0.3})
+        errors = {"yaw": 0.3, "position_std": 0.06, "size_std": 0.08}
+        plain.append({"label": label, "position": [x, y, z], "size": [a, b, c], **errors})
         place, half = (-100 * y, 100 * (z - c / 2), -100 * x), (50 * b, 50 * c, 50 * a)
-        other.append({"label": label, "position": place, "size": half, "yaw": 0.3})
+        errors = {"yaw": 0.3, "position_std": 6.0, "size_std": 4.0}
+        other.append({"label": label, "position": place, "size": half, **errors})
     view = {"x": 0.5, "y": -0.25, "yaw": 0.1}
     usual = await ask(measured, question, objects=plain, frame_id="map", viewpoint=view)
     view = {"x": 50.0, "y": -25.0, "yaw": 0.1}
@@ -293,6 +296,38 @@ async def test_a_scene_in_other_conventions_has_the_same_answer(measured, questi
             for place in entry["placements"]:
                 place.pop("offset", None)
     assert answer == usual
+
+
+async def test_larger_errors_make_relations_of_boxes_less_certain(measured):
+    """A lamp on a desk. Without the fields, a position has 5 cm, and a height 10 % of it."""
+
+    async def on_top(**errors: float) -> float:
+        objects = [
+            {"label": "desk", "position": [2, 0, 0.4], "size": [0.7, 1.4, 0.8], **errors},
+            {"label": "lamp", "position": [2, 0, 0.9], "size": [0.2, 0.2, 0.2], **errors},
+        ]
+        if not errors:
+            objects = [{**objects[0], "size_std": 0.08}, {**objects[1], "size_std": 0.02}]
+        found = (await ask(measured, "relations", objects=objects, top_k=50))["relations"]
+        wanted = ("lamp", "on-top", "desk")
+        (entry,) = [x for x in found if (x["subject"], x["relation"], x["object"]) == wanted]
+        return float(entry["probability"])
+
+    errors = (0.0, 0.05, 0.1, 0.2)
+    p = [await on_top(position_std=error, size_std=0.0) for error in errors]
+    assert p == sorted(p, reverse=True)
+    assert p[0] > 0.95
+    assert p[-1] < 0.7
+    assert await on_top() < await on_top(position_std=0.05, size_std=0.0)
+
+
+@pytest.mark.parametrize("field", ["position_std", "size_std"])
+@pytest.mark.parametrize("value", [-0.1, "x", 1e8])
+async def test_errors_of_boxes_are_checked(measured, field, value):
+    desk = {"label": "desk", "position": [2, 0, 0.4], "size": [0.7, 1.4, 0.8], field: value}
+    response = await measured.post("/relations", json={"objects": [desk, "lamp"]})
+    (error,) = problem(response, 422, "invalid-request")["errors"]
+    assert error["pointer"] == f"#/objects/0/{field}"
 
 
 async def test_up_in_an_optical_frame_is_refused(measured):

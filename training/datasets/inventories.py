@@ -196,6 +196,21 @@ def shipped_things() -> Mapping[str, Thing]:
     return read_things(KNOWLEDGE / THINGS)
 
 
+def with_shipped(tables: Iterable[Mapping[str, Thing]]) -> dict[str, Thing]:
+    """Return the things of tables and of the repository by label. The first of a label counts."""
+    described: dict[str, Thing] = {}
+    for things in (*tables, shipped_things()):
+        for label, thing in things.items():
+            described.setdefault(label, thing)
+    return described
+
+
+@cache
+def shipped_inventory() -> Inventory:
+    """Read the inventories of the repository."""
+    return read_inventory(KNOWLEDGE / "inventories.csv")
+
+
 def read_inventory(path: Path) -> Inventory:
     """Read the places of a file and the things beside it, without placeholder labels.
 

@@ -8,8 +8,7 @@ from functools import cache
 from typing import Final
 
 from app.scene import ObjectClass, Vocabulary, label_key
-from training.datasets.files import KNOWLEDGE
-from training.datasets.inventories import Thing, read_inventory
+from training.datasets.inventories import Thing, shipped_inventory
 from training.datasets.vocabulary import (
     INDOOR_FILE,
     curated_names,
@@ -25,7 +24,7 @@ LEAST_PLACES: Final = 0.5
 def written_vocabulary() -> Vocabulary:
     """Build the vocabulary: the commonest things of the written places come first."""
     names, indoor = curated_names(), read_vocabulary(INDOOR_FILE)
-    inventory = read_inventory(KNOWLEDGE / "inventories.csv")
+    inventory = shipped_inventory()
     things, places = inventory.things, inventory.places
     expected: defaultdict[str, float] = defaultdict(float)
     for place in places:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from training.datasets import AnnotatedScene, DatasetError
-from training.datasets.inventories import Inventory, Place, Thing, read_inventory, shipped_things
+from training.datasets.inventories import Inventory, Place, Thing, read_inventory, with_shipped
 from training.datasets.jsonl import scan_jsonl
 from training.datasets.readers import guess_format, read_scenes
 from training.datasets.records import InvalidLinesError
@@ -43,12 +43,7 @@ class Material:
     @property
     def descriptions(self) -> Mapping[str, Thing]:
         """The described things by label: of the tables beside the inventories, then the shipped."""
-        described: dict[str, Thing] = {}
-        own = (inventory.things for inventory in self.inventories.values())
-        for things in (*own, shipped_things()):
-            for label, thing in things.items():
-                described.setdefault(label, thing)
-        return described
+        return with_shipped(inventory.things for inventory in self.inventories.values())
 
     def drawn(self, each: int) -> list[AnnotatedScene]:
         """Draw a number of scenes of each written place. Training draws others, of the same law."""

@@ -1,8 +1,11 @@
 """Fit the prior of possibility (`app.model.possibility`) to stated supports and to boxes.
 
-The examples are pairs of classes in a scene. A pair of a listed relation, a support link or a
-touching box is possible. A pair of the same scene for which the source shows that the relation does
-not hold is a counter-example, unless another scene shows it. Sources for research take no part.
+The examples are pairs of classes in a scene. A pair of a listed relation or of a support link is
+possible if two scenes state it. Any other pair is a counter-example if a scene shows that the
+relation does not hold. Sources for research take no part.
+
+Few own scenes show too few pairs. Then the weights are those of the written places
+(`training.datasets.inventories`): what can stand on what is the same everywhere.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from typing import Final
 
@@ -22,7 +26,6 @@ from app.model.possibility import (
     IN,
     ON,
     OVER,
-    SURFACE,
     UNDER,
     Possibility,
     features,
@@ -30,11 +33,12 @@ from app.model.possibility import (
 from app.scene import CANONICAL, Vocabulary, label_key
 from app.scene.scene import CONTACT
 from app.scene.spatial_relations import ABOVE, INSIDE, ON_TOP
-from training.datasets import EncodedScene
-from training.datasets.inventories import Thing, shipped_things
+from training.datasets import EncodedScene, encode
+from training.datasets.inventories import Thing, complete_scene, shipped_inventory
 from training.datasets.records import AnnotatedScene
 from training.datasets.roles import lift_of
 from training.datasets.sources import source_of
+from training.datasets.written import written_vocabulary
 from training.fit.regression import logistic
 
 Floats = NDArray[np.float64]
@@ -61,6 +65,8 @@ _DENIED: Final = {
     OVER: (ABOVE, True),
     IN: (INSIDE, True),
 }
+
+_NEUTRAL: Final = np.zeros((4, FEATURES))
 
 Pair = tuple[int, int, int]  # place, class at this place, and class of the other object
 
@@ -104,18 +110,45 @@ def fit_possibility(
     annotated: Sequence[AnnotatedScene],
     encoded: Sequence[EncodedScene],  # the same scenes
     vocabulary: Vocabulary,
-    things: Mapping[str, Thing] | None = None,  # None: those of the repository
+    things: Mapping[str, Thing],  # descriptions, by label
 ) -> Possibility | None:
-    """Fit the prior to scenes; None if they show too few possible pairs."""
-    possible, impossible = stated_pairs(annotated, vocabulary), denied_pairs(encoded, vocabulary)
-    if sum(place == ON for place, *_ in possible) < _LEAST_PAIRS:
+    """Describe the classes, and fit the weights to scenes; None if no class has a description.
+
+    If the scenes show too few possible pairs, the weights are those of the written places.
+    """
+    prior = describe(vocabulary, things, _NEUTRAL)
+    if not prior.is_described.any():
         return None
-    neutral = np.zeros((4, FEATURES))
-    prior = describe(vocabulary, shipped_things() if things is None else things, neutral)
-    weights = np.stack(
-        [_fit_place(prior, vocabulary, place, possible, impossible) for place in range(4)]
-    )
-    return describe(vocabulary, shipped_things() if things is None else things, weights)
+    possible = stated_pairs(annotated, vocabulary)
+    if sum(place == ON for place, *_ in possible) < _LEAST_PAIRS:
+        weights = _written_weights()
+    else:
+        weights = _fit_weights(prior, vocabulary, possible, denied_pairs(encoded, vocabulary))
+    return replace(prior, weights=weights)
+
+
+@cache
+def _written_weights() -> Float[NDArray[np.float32], "4 features"]:
+    """Fit the weights to the written places of the repository, in two seconds.
+
+    Parts of them show what does not stand at a place, because complete ones show a million pairs.
+    """
+    vocabulary, inventory = written_vocabulary(), shipped_inventory()
+    possible = stated_pairs(map(complete_scene, inventory.places), vocabulary)
+    impossible = denied_pairs(encode(inventory.scenes(1, seed=0), vocabulary), vocabulary)
+    prior = describe(vocabulary, inventory.things, _NEUTRAL)
+    return _fit_weights(prior, vocabulary, possible, impossible)
+
+
+def _fit_weights(
+    prior: Possibility,
+    vocabulary: Vocabulary,
+    possible: Counter[Pair],
+    impossible: Counter[tuple[int, int, int]],
+) -> Float[NDArray[np.float32], "4 features"]:
+    """Fit the weights of all places; 0 for a place without examples of both kinds."""
+    places = [_fit_place(prior, vocabulary, place, possible, impossible) for place in range(4)]
+    return np.stack(places).astype(np.float32)
 
 
 def stated_pairs(scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary) -> Counter[Pair]:
@@ -190,21 +223,20 @@ def _fit_place(
         and (pair := (i, j) if outgoing else (j, i)) not in seen
         and not (place == ON and (UNDER, pair[1], pair[0]) in possible)
     }
-    if not right or not wrong:
-        return np.zeros(FEATURES)
-    pairs = np.array([*right, *wrong])
+    pairs = np.array([*right, *wrong], np.int64).reshape(-1, 2)
     counts = np.log1p(np.array([*right.values(), *wrong.values()], float))
     truth = np.arange(len(pairs)) < len(right)
     weight = counts / np.where(truth, counts[truth].sum(), counts[~truth].sum()) * len(right)
-    known = (prior.traits[pairs, SURFACE] >= 0).all(1)
+    known = prior.is_described[pairs].all(1)
+    if not (known & truth).any() or not (known & ~truth).any():
+        return np.zeros(FEATURES)
     things, others = (prior.rows(of, vocabulary.sizes[of]) for of in pairs[known].T)
     phi, truth, weight = features(place, things, others), truth[known], weight[known]
     used, weights = np.ones(FEATURES, np.bool_), np.zeros(FEATURES)
     while used.any():
         *fitted, _ = logistic(-phi[:, used], truth, weight)
-        weights[:] = 0.0
-        weights[used] = fitted
-        if (weights >= 0).all():
+        if min(fitted) >= 0:
+            weights[used] = fitted
             break
-        used = weights > 0  # no feature makes a place more possible
+        used[used] = np.array(fitted) > 0  # no feature makes a place more possible
     return weights

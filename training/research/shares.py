@@ -7,8 +7,8 @@ and with variants in which a part of the scores is left out. No variant is calib
 metrics are ranks.
 
     hidden context   the relations see the hidden units of an empty scene
-    relation score   log p(relation) of a missing object at a place, or the relation scores z and d
-                     of misplaced entries
+    relation score   log p(relation) of a missing object at a place, or the relation scores z, d
+                     and u of misplaced entries; u has the prior of possibility
     counts           counts of classes at places, shares of stands and of supporters
 """
 
@@ -85,7 +85,7 @@ VARIANTS: dict[tuple[str, str], dict[str, Callable[[SceneModel], SceneModel]]] =
     },
     ("T3c moved", "named first"): {
         "whole": whole,
-        "without relation score": misplaced(relation=0.0, change=0.0),
+        "without relation score": misplaced(relation=0.0, change=0.0, unknown=0.0),
         "without counts": misplaced(stand=0.0, supporter=0.0),
     },
 }

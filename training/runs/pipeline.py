@@ -48,7 +48,7 @@ class SplitScenes:
     data: DataConfig
     vocabulary: Vocabulary  # the scenes use the indices of its classes
     roles: RoleCounts  # of the classes in the training scenes
-    possibility: Possibility | None  # of the classes; None: the training scenes show too little
+    possibility: Possibility | None  # of the classes; None: no class has a description
     parts: dict[str, list[EncodedScene]]
     counts: dict[str, int]  # number of scenes, by source
     digests: dict[str, str]  # sha256 of the contents of the scenes, by source
@@ -172,6 +172,14 @@ def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path)
     return with_typical_sizes(vocabulary, scenes)
 
 
+def _things(data: DataConfig, root: Path) -> dict[str, inventories.Thing]:
+    """Return the described things of the tables beside own inventories, and of the repository."""
+    own = (source for source in data.sources if is_file(source) and is_inventory(source))
+    beside = (_path(source, root).with_name(inventories.THINGS) for source in own)
+    tables = (inventories.read_things(path) for path in beside if path.is_file())
+    return inventories.with_shipped(tables)
+
+
 def split_and_encode(
     data: DataConfig,
     scenes: dict[str, list[AnnotatedScene]],
@@ -183,7 +191,7 @@ def split_and_encode(
     parts = split(all_scenes, seed=data.split_seed, protocol=data.split)
     if vocabulary is None:
         vocabulary = build_vocabulary(data, parts["train"], root)
-    roles = count_roles(parts["train"], vocabulary)
+    roles, things = count_roles(parts["train"], vocabulary), _things(data, root)
     encoded: dict[str, list[EncodedScene]] = {
         name: encode(part, vocabulary, roles) for name, part in parts.items()
     }
@@ -191,7 +199,7 @@ def split_and_encode(
         data=data,
         vocabulary=vocabulary,
         roles=roles,
-        possibility=fit_possibility(parts["train"], encoded["train"], vocabulary),
+        possibility=fit_possibility(parts["train"], encoded["train"], vocabulary, things),
         parts=encoded,
         counts={name: len(source) for name, source in scenes.items()},
         digests={name: digest_of(source) for name, source in scenes.items()},

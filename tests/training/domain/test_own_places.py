@@ -5,16 +5,20 @@ import numpy as np
 import pytest
 
 from app import questions
+from app.model.possibility import IN, ON
 from app.registry import Store
 from app.scene import Scene
+from app.scene.stands import FLOOR, SUPPORTED
 from tests.training.commands import init, invoke, prepared
 from tests.training.scenes import request, scene
 from training.datasets import generate_rooms
-from training.datasets.inventories import read_inventory
+from training.datasets.inventories import THING_COLUMNS, read_inventory
 from training.datasets.jsonl import write_jsonl
 from training.datasets.rooms import DOMAINS
 from training.fit.count_statistics import fit_counts
+from training.fit.draft import placed_draft
 from training.fit.objects import ObjectScenes
+from training.machines import MachineSpec, build
 from training.runs.config_files import load_config
 from training.runs.pipeline import SplitScenes
 from training.runs.publish import data_sources
@@ -83,6 +87,31 @@ def test_as_many_written_scenes_are_drawn_as_seen_ones(tmp_path) -> None:
     assert load_config(str(tmp_path / "ward")).data.written == 450
 
 
+def test_own_places_have_a_prior_of_possibility(tmp_path) -> None:
+    """Ten places show few pairs. The things of the own table count like those of the repository."""
+    rows = ["hall,table,floor,", "hall,cup,on-top,table", "hall,vat,floor,", "hall,gizmo,,"]
+    (tmp_path / "places.csv").write_text("\n".join([HEAD, *rows]))
+    vat = ["vat", 1.2, 1.2, 0.9, 1.3, "floor 1", "no", "yes", "no", "", ""]
+    table = [THING_COLUMNS, vat]
+    (tmp_path / "things.csv").write_text("\n".join(",".join(map(str, row)) for row in table))
+    init(tmp_path / "places.csv", folder=tmp_path / "hall")
+    data = prepared(tmp_path / "hall").training_data()
+    words, prior = data.vocabulary, data.possibility
+    assert prior is not None
+    index = [words.index(label) for label in ("cup", "table", "vat", "gizmo")]
+    assert prior.is_described[index].tolist() == [True, True, True, False]
+    rows = prior.rows(np.array(index), words.sizes[index])
+    c = prior.log_p(rows, rows)
+    assert c[ON, 0, 1] > c[ON, 1, 0] + 3  # the cup on the table, and the table on the cup
+    assert c[IN, 0, 2] > c[IN, 0, 1]  # the vat contains things, and the table sometimes does
+    assert c[ON, 0, 1] > c[ON, 2, 1] + 3
+    places = placed_draft(build(MachineSpec("rbm", V=len(words), A=5, units=1)), data).places
+    assert places is not None
+    # No own scene shows a cup on the floor, nor that the vat hangs.
+    assert places.stands[index[0], SUPPORTED] > 0.8
+    assert places.stands[index[2], FLOOR] > 0.8
+
+
 def test_errors_are_listed_and_nothing_is_written(tmp_path) -> None:
     path = tmp_path / "places.csv"
     path.write_text(f"{HEAD}\nhall,,,\nhall,cup,on-top,table\n")
@@ -126,6 +155,8 @@ def test_from_the_table_to_answers(ward, tmp_path) -> None:
     assert "published ward@1.0.0" in invoke("train", folder, "--publish", "1.0.0", *runs)
     artifact = store.load("ward", "1.0.0")
     model = artifact.model
+    assert model.possibility is not None
+    assert (model.possibility.weights >= 0).all()
     assert "Scenes drawn from written places have 100.0 %" in " ".join(artifact.card.split())
     assert model.calibration.outlier_lines is not None
     words = model.vocabulary

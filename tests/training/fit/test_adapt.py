@@ -6,9 +6,11 @@ import torch
 
 from app import questions
 from app.inference import MachineSpec, Weights
-from app.model import SceneModel
+from app.model import Possibility, SceneModel
+from app.model.possibility import UNKNOWN
 from app.registry import Store
 from app.scene import ObjectClass
+from tests.questions.artifacts import larger_artifact
 from tests.training.scenes import request
 from training.fit.adapt import HomeScenes, TrainedOn, adapt, extended
 from training.machines import build, machine_of, weights_of
@@ -136,6 +138,65 @@ def test_known_objects_get_the_same_answers_beside_new_classes(model):
     assert [x["room_type"] for x in before["room_types"]] == [
         x["room_type"] for x in after["room_types"]
     ]
+
+
+def with_prior() -> SceneModel:
+    """A model with random weights and a prior of strong weights. The vase has no description."""
+    model = larger_artifact("triway-states")
+    generator = np.random.default_rng(0)
+    traits = np.column_stack([generator.choice([0, 0.5, 1], (9, 2)), generator.choice(4, 9)])
+    traits[model.vocabulary.index("vase")] = UNKNOWN
+    prior = Possibility(
+        stands=generator.dirichlet(np.ones(5), 9).astype(np.float32),
+        traits=traits.astype(np.float32),
+        spread=generator.uniform(0.1, 0.5, 9).astype(np.float32),
+        weights=generator.uniform(1, 3, (4, 4)).astype(np.float32),
+    )
+    objects = [replace(entry, size=(0.2 * (k + 1),) * 3) for k, entry in
+               enumerate(model.vocabulary.objects)]  # fmt: skip
+    vocabulary = replace(model.vocabulary, objects=tuple(objects))
+    return replace(model, vocabulary=vocabulary, possibility=prior)
+
+
+def test_new_classes_keep_the_prior_of_the_others():
+    model = with_prior()
+    larger = extended(model, NEW, ["darkroom"])
+    assert larger.possibility is not None
+    larger.possibility.check(A=5, V=11, C=3)
+    index = np.arange(11)
+    rows = larger.descriptions
+    c, old = larger.possibility.log_p(rows, rows), model.descriptions
+    np.testing.assert_array_equal(c[:, :9, :9], model.possibility.log_p(old, old))
+    assert not larger.possibility.is_described[9:].any()
+    assert not c[:, 9:].any()
+    assert not c[:, :, 9:].any()
+    assert larger.spread[index[9:]] == pytest.approx(np.median(model.spread))
+    labels = ["bed", "lamp", "vase", "desk"]
+    before, after = (
+        questions.relations(side, request(side, *labels), top_k=100)["relations"]
+        for side in (model, larger)
+    )
+    assert [_close(x) for x in before] == [_close(x) for x in after]
+    # Without the prior, the answers differ.
+    bare = extended(replace(model, possibility=None), NEW, ["darkroom"])
+    without = questions.relations(bare, request(bare, *labels), top_k=100)["relations"]
+    assert [_close(x) for x in without] != [_close(x) for x in after]
+
+
+def test_relations_of_a_new_class_have_no_prior():
+    """The logits of a pair with a new class are those of a model without the prior."""
+    model = with_prior()
+    sides = [extended(side, NEW, []) for side in (model, replace(model, possibility=None))]
+    p = [
+        {
+            (x["subject"], x["relation"], x["object"]): x["probability"]
+            for x in questions.relations(side, request(side, "stairlift", "lamp"), top_k=100)[
+                "relations"
+            ]
+        }
+        for side in sides
+    ]
+    assert p[0] == pytest.approx(p[1])
 
 
 def _close(value: object) -> object:

@@ -1,3 +1,4 @@
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -5,17 +6,25 @@ import pytest
 import torch
 
 from app.model import Misplaced
+from app.model.calibration import KINDS, WEIGHTS
 from app.questions import misplaced
-from app.questions.misplaced import BESIDE, STAND, SUPPORT
-from app.scene.spatial_relations import ON_TOP
+from app.questions.misplaced import BESIDE, HELD, POSED, SUPPORT, TERMS, UNHELD, Entries
+from app.scene.scene import observe
+from app.scene.spatial_relations import INSIDE, ON_TOP
 from tests.questions.artifacts import artifact_of
-from tests.training.evaluation.furnished_rooms import A
+from tests.training.evaluation.furnished_rooms import STRUCTURE as WALLS
+from tests.training.evaluation.furnished_rooms import VOCABULARY, A, rooms
 from tests.training.evaluation.scenes import scene
 from training.datasets.cases import draw_true_relations, scene_of, scene_rng
-from training.datasets.moved import moved_by_triple
+from training.datasets.inventories import shipped_things
+from training.datasets.moved import lifted_or_sunk, moved_by_triple, moved_scene, posed_scene
+from training.datasets.roles import count_roles
+from training.evaluation.asking import score_misplaced
 from training.evaluation.outlier_tasks import ALARMS
 from training.fit import calibrate_misplaced as module
 from training.fit.calibrate_misplaced import fit_misplaced, hardest_quantile
+from training.fit.draft import draft_artifact, fit_places
+from training.fit.possibility import fit_possibility
 from training.machines import MachineSpec, build
 
 V, SUPPORTERS = 9, 4
@@ -90,7 +99,7 @@ def test_untouched_scenes_keep_the_share_of_alarms(artifact, fitted):
     """400 other scenes. With these standard errors, a larger share has a probability below .002."""
     model = judging(artifact, fitted)
     for name, promise in ALARMS.items():
-        share = 0.45 * promise
+        share = module._BUDGET["support"] * promise
         alarms = 0
         for one in world(400, 2):
             triples = draw_true_relations(one, STRUCTURE, scene_rng(one, 0))
@@ -144,10 +153,8 @@ def test_small_sources_count_as_one_and_equal_values_raise_no_alarm():
 def entries_of(*rows):
     """Entries (kind, triple, mover)."""
     kinds, triples, movers = zip(*rows, strict=True)
-    n = len(rows)
-    return module.Entries(
-        np.array(triples), np.array(kinds), np.zeros((n, 4)), np.array(movers, dtype=np.int64)
-    )
+    terms = np.zeros((len(rows), TERMS))
+    return Entries(np.array(triples), np.array(kinds), terms, np.array(movers, dtype=np.int64))
 
 
 def test_a_moved_object_makes_its_support_wrong_and_its_other_relations_uncertain():
@@ -155,15 +162,114 @@ def test_a_moved_object_makes_its_support_wrong_and_its_other_relations_uncertai
         (SUPPORT, (ON_TOP, 2, 0), 2),
         (BESIDE, (0, 2, 1), 2),
         (SUPPORT, (ON_TOP, 3, 2), 3),
-        (STAND, (ON_TOP, 2, -1), 2),
-        (SUPPORT, (ON_TOP, 1, 0), 1),
+        (POSED, (ON_TOP, 2, -1), 2),
+        (HELD, (ON_TOP, 1, 0), 1),
+        (UNHELD, (INSIDE, 4, 2), 4),
     )
     wrong, usable = module._truth(entries, 2)
-    assert wrong.tolist() == [True, False, False, True, False]
-    assert usable.tolist() == [True, False, False, True, True]
+    assert wrong.tolist() == [True, False, False, True, False, False]
+    # What is on or in the moved object may be right or wrong.
+    assert usable.tolist() == [True, False, False, True, True, False]
     wrong, usable = module._truth(entries, (ON_TOP, 3, 2))
-    assert wrong.tolist() == [False, False, True, False, False]
+    assert wrong.tolist() == [False, False, True, False, False, False]
     assert usable.all()
     wrong, usable = module._truth(entries, None)
     assert not wrong.any()
     assert usable.all()
+
+
+# ------------------------------------------------------------------------------------------ boxes
+
+KINDS_OF_BOXES = KINDS[POSED:]
+KIND_OF = {
+    "on-floor": "on_floor",
+    "wrong-support": "on_object",
+    **dict.fromkeys(("floats", "sunk-in"), "unheld"),
+}
+
+
+@pytest.fixture(scope="module")
+def furnished():
+    """A machine without any knowledge, and the places of furnished rooms."""
+    spec = MachineSpec("triway", V=len(VOCABULARY), A=A, units=1, K=1)
+    machine = build(spec).eval().requires_grad_(False)
+    scenes = rooms(400, 2).scenes
+    prior = fit_possibility([], scenes, VOCABULARY, shipped_things())
+    places = fit_places(scenes, count_roles((), VOCABULARY), VOCABULARY, prior)
+    model = draft_artifact(machine, VOCABULARY, places, prior)
+    return judging(model, fit_misplaced(model, rooms(200, 1).scenes))
+
+
+def test_boxes_at_wrong_places_are_judged_by_their_places(furnished):
+    """Moved objects, and objects that float or are sunk in, in 60 other rooms."""
+    fitted = furnished.calibration.misplaced
+    for kind in KINDS_OF_BOXES:
+        judgement = getattr(fitted, kind)
+        assert judgement.stand < 0
+        assert all(getattr(judgement, name) <= 0 for name in WEIGHTS)
+        assert judgement.entries >= -1
+        # No line depends on the number of entries.
+        assert all(getattr(judgement.lines, name).log_count == 0 for name in ALARMS)
+    structure, first = WALLS.numpy(), Counter()
+    for make in (moved_scene, lifted_or_sunk):
+        for one in rooms(60, 3).scenes:
+            case = make(one, structure, scene_rng(one, 0))
+            if case is not None:
+                named = score_misplaced(furnished, case[0])
+                right = bool(named) and named[0]["moved"] == str(case[1])
+                first[make.__name__, right] += 1
+    for make in (moved_scene, lifted_or_sunk):
+        right, wrong = first[make.__name__, True], first[make.__name__, False]
+        assert right + wrong >= 40
+        assert right / (right + wrong) > 0.6
+
+
+def test_untouched_boxes_keep_the_share_of_alarms_of_each_kind(furnished):
+    """200 other rooms, with the standard errors of both."""
+    asked = [posed_scene(one) for one in rooms(200, 4).scenes]
+    for name, promise in ALARMS.items():
+        alarms = Counter()
+        for request in asked:
+            entries = misplaced(furnished, seen(furnished, request), sensitivity=name)
+            alarms.update({KIND_OF[entry["reason"]] for entry in entries if entry["is_misplaced"]})
+        for kind in KINDS_OF_BOXES:
+            share = module._BUDGET[kind] * promise
+            assert alarms[kind] / 200 <= share + 3 * np.sqrt(share * (1 - share) / 100)
+
+
+def seen(model, request):
+    words = model.vocabulary
+    return observe(request, typical_sizes=words.sizes, spread=model.spread, roles=model.roles)
+
+
+@pytest.mark.parametrize("moved", range(4))
+def test_a_part_of_boxes_keeps_the_moved_object(moved):
+    whole = replace(scene_of(scene([0, 1, 2, 3]), range(4), ()), relations=None)
+    kept = Counter()
+    for seed in range(60):
+        part, index = module._part_with(whole, moved, np.random.default_rng(seed))
+        assert part.objects[index] == whole.objects[moved]
+        rest = iter(whole.objects)
+        assert all(thing in rest for thing in part.objects), "the order stays"
+        kept.update(thing.id for thing in part.objects)
+    assert kept.pop(str(moved)) == 60
+    # Each other object is in about half of the parts.
+    assert len(kept) == 3
+    assert all(0.25 < count / 60 < 0.75 for count in kept.values())
+
+
+def test_scenes_with_boxes_are_asked_in_parts_too(furnished):
+    """The moved or unheld object is in each part, and no scene has two wrong objects."""
+    kinds = Counter()
+    for one in rooms(30, 5).scenes:
+        whole = posed_scene(one)
+        asked = [case for case in module._questions(furnished, one, 0) if case[0].has_boxes]
+        before = {thing.id: thing.position for thing in whole.objects}
+        for request, wrong in asked:
+            moved = {thing.id for thing in request.objects if thing.position != before[thing.id]}
+            assert (wrong is None) == (not moved)
+            if wrong is not None:
+                assert request.objects[wrong].id in moved
+            kinds[wrong is None, len(request.objects) == len(whole.objects)] += 1
+    assert min(kinds.values()) >= 20
+    assert len(kinds) == 4

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from app.model.calibration import CountSlope, PlaceFit
+from app.model.calibration import KINDS, CountSlope, PlaceFit
 from app.questions.posterior import Posterior
 from tests.questions.artifacts import larger_artifact, scene_of
 from training.evaluation.asking import missing_log_p_at
@@ -46,7 +46,7 @@ def test_kinds_that_the_model_does_not_judge_stay_unjudged():
     artifact = larger_artifact("triway-states")
     judged = misplaced(relation=0.0)(artifact).calibration.misplaced
     assert judged.confirmed == artifact.calibration.misplaced.confirmed
-    for kind in ("lateral", "support", "above", "under", "stand"):
+    for kind in KINDS:
         before, after = (getattr(one, kind) for one in (artifact.calibration.misplaced, judged))
         assert (after is None) == (before is None)
         assert after is None or after.relation == 0.0
