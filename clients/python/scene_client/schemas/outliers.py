@@ -64,28 +64,33 @@ Reason = Literal["relation", "on-floor", "wrong-support", "floats", "sunk-in"]
 
 
 class MisplacedRelation(ScoredRelation):
-    """A relation in the form of the request, or the place of a box, and p that it is wrong.
+    """A relation in the form of the request, or the place of a box.
 
-    For a box on the floor, above it or sunk into it, `object` is `floor`.
+    `probability` is the probability that it is wrong. With boxes, an entry is the likeliest wrong
+    place of the object `subject`. For a box on the floor, above it or sunk into it, `object` is
+    `floor`.
     """
 
     is_misplaced: bool = False
     """true if `probability` reaches the threshold for `sensitivity`"""
     reason: Reason = "relation"
-    """`relation`: the request states a wrong relation. Or a box is at a wrong place: `on-floor`,
-    though its class hardly stands there; `wrong-support`, on or in a wrong object; `floats`, held
-    by nothing; `sunk-in`, inside the floor or a solid object"""
+    """`relation`: a relation that the request states. Others are places of boxes: `on-floor`, on
+    the floor (on-top `floor`); `wrong-support`, on or in another object (on-top or inside);
+    `floats`, held by no listed object (above `floor`); `sunk-in`, partly below the floor or within
+    a solid object (inside). The place is wrong with `probability`"""
     moved: str | None = None
-    """id of the object that stands in the wrong place if the relation is misplaced"""
+    """id of the object that stands in the wrong place if the relation is misplaced. With boxes, it
+    is the subject"""
 
 
 class OutliersAnswer(Answer):
-    """Results for all objects and for all observed relations.
+    """Results for all objects, and for all stated relations or for the places of boxes.
 
-    `outliers` starts with the most probable outlier. `misplaced` starts with the relation that is
-    most probably false. There, `probability` is the probability that the relation is false. A
-    model that was calibrated with too few scenes gives no judgement: the list is empty, and a
-    warning says so.
+    `outliers` starts with the most probable outlier. `misplaced` starts with the entry that is most
+    probably wrong. If the request states relations, it has an entry for each of them that the model
+    judges. Otherwise, it has at most one entry for each object with a box: supports, and other
+    places that are wrong with a probability of at least .05. A model that was calibrated with too
+    few scenes gives no judgement: the list is empty, and a warning says so.
     """
 
     threshold: Probability | None = None

@@ -43,7 +43,8 @@ class RelationsRequest(SceneRequest):
     ] = None
     """limit the answer to these pairs of subject and object"""
     include_opposites: bool = False
-    """also list right, behind, under, below and contains"""
+    """also list right, behind, under, below and contains. Without opposites and `pairs`, under may
+    replace the opposite on-top where it is the usual word: a chair under a table"""
 
 
 @dataclass(slots=True)
@@ -69,11 +70,13 @@ class ExpectedRelation(ScoredRelation):
     """A relation and the probability that it holds, given that both objects are in the scene.
 
     For an observed relation, `probability` is that of the evidence: the product of the confidences
-    of both objects. A relation that the boxes of both objects exclude has at most .01.
+    of both objects, and of the probability of the relation under the errors of their boxes. A
+    relation that the boxes of both objects exclude has at most .01.
     """
 
     observed: bool = False
-    """true if the request states the relation or the positions show it"""
+    """true if the request states the relation, or if the boxes show it with a probability of at
+    least .5"""
     expected: Probability | None = None
     """for an observed relation: its probability if it were not observed"""
 

@@ -209,10 +209,11 @@ class Detection(Request):
     """rotation about the z axis in radians, instead of `orientation`; with `up` "y", about the y
     axis"""
     position_std: Extent | None = None
-    """standard deviation of each coordinate of `position` in `units`; default: 5 cm"""
+    """standard deviation of each coordinate of `position` in `units`; default: 5 cm. Relations and
+    wrong places of boxes are probabilities under these errors"""
     size_std: Extent | None = None
-    """standard deviation of each extent of `size` in `units`; default: 10 % of the height, or
-    without `size`, the spread of the class"""
+    """standard deviation of each extent of `size` in `units`. Only the height counts. Default: 10 %
+    of the height, or without `size`, the spread of the class"""
     supported_by: Id | None = None
     """id of the object under this object: the relation on-top. Unused if the service derives
     relations from the positions of all objects"""
