@@ -17,7 +17,7 @@ box. Rules 1 to 3 apply to two boxes whose footprints overlap by at least 30 % o
    The three cases have the weights `TOUCH` · N(lift; 0, s), Φ(lift / s) and Φ(-lift / s). So two
    boxes without errors touch if the lift is at most 5 cm. A box that surrounds a smaller box does
    not touch it. A box surrounds a smaller box if it is more than 10 cm high, and if it reaches both
-   lower and higher than the smaller box.
+   lower and higher than the smaller box. Boxes with centres at one height reach into each other.
 2. If the upper box touches the lower box, *on-top* holds if the lower box carries the upper box.
    Otherwise *above* holds. A box carries every box with a smaller footprint, and each larger box
    whose centre is over it.
@@ -538,10 +538,11 @@ def _stack(
         is_nested = rise > 0 and tops[1] > tops[0] and larger_height > 2 * CONTACT
     upper, lower = (i, j) if points[i, 2] > points[j, 2] else (j, i)
     lift = points[upper, 2] - extents[upper, 2] / 2 - (points[lower, 2] + extents[lower, 2] / 2)
-    if points[i, 2] == points[j, 2] and lift >= -CONTACT:
+    is_level = points[i, 2] == points[j, 2]
+    if is_level and lift >= -CONTACT:
         return 0.0  # two thin boxes at the same height
     touch, above, deep = contact_weights(lift, math.hypot(errors[i, 1], errors[j, 1]))
-    if is_nested and upper == larger:
+    if is_level or (is_nested and upper == larger):
         touch, above, deep = 0.0, 0.0, 1.0
     total = (touch + above + deep) / overlap
     touch, above, deep = touch / total, above / total, deep / total

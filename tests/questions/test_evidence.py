@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from app import questions
@@ -114,6 +115,27 @@ def test_boxes_exclude_stacked_relations_in_both_directions(stated):
         assert answer["above", 2, 3].observed
         assert answer["above", 2, 3].probability == 1
         assert answer["above", 3, 2].probability <= 0.0100001
+
+
+@pytest.mark.parametrize("said", [2.0, 1.0])
+def test_lists_say_under_where_people_do(said):
+    """Two scenes say that the lamp (1) is under the desk (2), or a single one, a possible error."""
+    words = {
+        "role_pair": np.array([1 * ARTIFACT.spec.V + 2], np.int32),
+        "role_counts": np.array([(0, said, 0)], np.float32),
+    }
+    artifact = replace(ARTIFACT, places=replace(ARTIFACT.places, **words))
+    scene = scene_of([1, 2, 3], [(ON_TOP, 1, 0)])
+
+    def stated(**options):
+        found = relations(artifact, scene, top_k=4096, **options)
+        return {(e.subject, e.relation, e.object): e.probability for e in found if e.observed}
+
+    assert stated() == {((0, "under", 1) if said > 1 else (1, "on-top", 0)): 1}
+    # A caller who names the pairs, or wants both directions, gets them as they are.
+    assert stated(pairs=[(1, 0)]) == {(1, "on-top", 0): 1}
+    both = stated(include_opposites=True)
+    assert both == {(1, "on-top", 0): 1, (0, "under", 1): 1}
 
 
 def test_a_model_without_relations_states_the_observed_ones_only():

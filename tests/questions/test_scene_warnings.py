@@ -248,3 +248,13 @@ def test_up_contradicts_an_optical_frame() -> None:
         with pytest.raises(ContradictionError) as error:
             warnings_of(room(), frame_id="camera_optical_frame", up=up)
         assert error.value.located[0].location == ("up",)
+
+
+def test_errors_of_boxes_are_read_in_metres():
+    entry = {"label": "bed", "position": [0, 0, 40], "size": [80, 105, 40]}
+    stated = {**entry, "position_std": 2, "size_std": 1}
+    request = OutliersRequest(objects=[stated, entry], units="cm", extents="half")
+    things = read_scene(request, VOCABULARY, Limits()).scene.objects
+    assert [(t.position_std, t.size_std) for t in things] == [(0.02, 0.02), (None, None)]
+    with pytest.raises(ValueError, match="position_std"):
+        OutliersRequest(objects=[{**entry, "position_std": -1}])
