@@ -381,6 +381,10 @@ class Places(TensorGroup):
         of_pairs = _SUPPORTER * share[other] + self.scenes(SUPPORTS, subject, other).sum(0)
         return of_pairs / (total[subject, None] + _SUPPORTER)
 
+    def any_supporters(self, other: Int[Indices, "M"]) -> Float[Floats, " M"]:
+        """Return the share of each class among all supporters."""
+        return self._supporters[1][other]
+
     @cached_property
     def _supporters(self) -> tuple[Float[Floats, "V"], Float[Floats, "V"]]:
         """Number of supporters of each class, and its share among all supporters."""

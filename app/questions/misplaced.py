@@ -45,9 +45,18 @@ from app.inference.elementary import sigmoid
 from app.model.calibration import KINDS, WEIGHTS, Judgement, Sensitivity
 from app.model.possibility import IN, ON, OVER, PRIOR_SHARE, UNDER, known_share
 from app.model.scene_model import SceneModel
+from app.model.statistics import Places
 from app.questions.answer import Fields, significant
 from app.questions.posterior import Posterior
-from app.questions.standing import FLOATS, ON_FLOOR, ON_OBJECT, SUNK, Standing, standing
+from app.questions.standing import (
+    FLOATS,
+    ON_FLOOR,
+    ON_OBJECT,
+    SUNK,
+    Standing,
+    shares_in_scene,
+    standing,
+)
 from app.scene.relation_table import Triple
 from app.scene.scene import Scene, boxes_of, errors_of
 from app.scene.spatial_relations import (
@@ -131,10 +140,13 @@ class _Evidence:
         self.moves = ~vocabulary.anywhere[self.classes]
         N, n = len(self.row), len(listed)
         self.stands, self.supporters = np.ones((N, 3)), np.ones((N, n))
+        self.any_supporters = np.zeros((1, n))
         if places is not None:
             self.stands = places.stands[self.classes].astype(np.float64)
             self.supporters = places.supporters(self.classes, listed)
-            self.supporters[:, vocabulary.structure[present.classes]] = 0.0
+            self.any_supporters = places.any_supporters(listed)[None].copy()
+            is_structure = vocabulary.structure[present.classes]
+            self.supporters[:, is_structure] = self.any_supporters[:, is_structure] = 0.0
         self._z, self._d = posterior.alone_log_odds(), posterior.relation_change()
         self._confirmed = {*model.calibration.misplaced.confirmed}
         self.prior, self.scenes = np.zeros((4, n, n)), np.full((len(STACKED), n, n), np.inf)
@@ -228,7 +240,7 @@ def _posed(model: SceneModel, posterior: Posterior, scene: Scene) -> Iterator[_E
     if model.places is None:
         return
     evidence, holding = _Evidence(model, posterior), {*scene.triples}
-    at = _standing(model, scene, evidence)
+    at = _standing(model, model.places, scene, evidence)
     for i, (reason, j) in enumerate(zip(at.reason.tolist(), at.anchor.tolist(), strict=True)):
         on_object = reason == ON_OBJECT
         if reason < 0 or not evidence.is_thing[i] or (j >= 0 and not evidence.is_thing[j]):
@@ -250,7 +262,7 @@ def _posed(model: SceneModel, posterior: Posterior, scene: Scene) -> Iterator[_E
         yield a, i, j, HELD, z, d, s, q, u, i
 
 
-def _standing(model: SceneModel, scene: Scene, evidence: _Evidence) -> Standing:
+def _standing(model: SceneModel, places: Places, scene: Scene, evidence: _Evidence) -> Standing:
     """Return what the boxes of a scene say. Furniture whose box is only its top reaches down."""
     vocabulary, shares = model.vocabulary, evidence.stands
     centres, extents = boxes_of(scene.objects, vocabulary.sizes)
@@ -263,14 +275,12 @@ def _standing(model: SceneModel, scene: Scene, evidence: _Evidence) -> Standing:
     longer = np.where(is_top, np.fmax(bottoms - reached, 0.0), 0.0)
     centres[:, 2] -= longer / 2
     extents[:, 2] += longer
-    unlisted = np.maximum(1.0 - evidence.supporters.sum(1), 0.0)
-    supporters = np.ascontiguousarray(evidence.supporters[:, evidence.row])
     yaws = np.array([thing.yaw for thing in scene.objects])
     boxes = centres, extents, yaws, errors
-    within = np.zeros(len(shares))
-    if model.places is not None:
-        within = model.places.within[evidence.classes].astype(np.float64)
-    return Standing(*standing(boxes, floor, shares, supporters, unlisted, within))
+    in_scene = shares_in_scene(np.concatenate([evidence.supporters, evidence.any_supporters]))
+    supporters = in_scene[:, [*evidence.row, -1]]
+    within = places.within[evidence.classes].astype(np.float64)
+    return Standing(*standing(boxes, floor, shares, np.ascontiguousarray(supporters), within))
 
 
 def wrong_log_odds(judgement: Judgement, terms: Float[Floats, "n 6"]) -> Float[Floats, "n"]:

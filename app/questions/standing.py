@@ -10,7 +10,8 @@ likelihood of b, per metre (N: normal with the error s, or rarely 3 s):
     floating    U
     sunk in     U, if the box reaches below the floor or into an object
 
-U is 1 / `ROOM` per metre. k is the share of things far below the top of such an object: on a seat,
+Things at wrong places are on or in the supporters of any things. U is 1 / `ROOM` per metre. k is
+the share of things far below the top of such an object: on a seat,
 or on the boards of a shelf (`Places.within`). The usual places of the class have the shares
 S of floor, wall and support, and q of its supporters. An object above a usual supporter is hardly
 on an unlisted object. Objects at wrong places have the shares `WRONG`. The evidence of a wrong
@@ -49,12 +50,24 @@ HUNG: Final = 2.0  # usual height in metres of the top of an object on a wall
 HUNG_STD: Final = 0.6  # its standard deviation
 _BLOCKED: Final = 0.8  # share of unlisted supports that a usual supporter below rules out
 _USUAL: Final = 0.2  # share q from which a supporter counts fully as usual
+_UNLISTED: Final = 0.3  # share of the unlisted supporters that a scene has
 _LEAST_WITHIN: Final = 0.1  # minimum of k
 _CARRIES: Final = 0.5  # footprint of a supporter, as a share of that on it, that carries fully
 _UNUSUAL: Final = 0.02  # weight of an unusual supporter in the choice of the anchor
 _LARGE, _RARE = 3.0, 0.03  # factor and share of large errors
 _LEAST: Final = 1e-6  # minimum of a likelihood
 _SQRT_2_PI: Final = math.sqrt(2.0 * math.pi)
+
+
+def shares_in_scene(supporters: Float[Floats, "R n"]) -> Float[Floats, "R n+1"]:
+    """Return the shares of the n listed classes among the supporters in a scene, then of unlisted.
+
+    ``supporters`` are the shares of the listed classes among the supporters of all scenes. An
+    unlisted supporter counts with `_UNLISTED` of its share, because the scene hardly has it.
+    """
+    unlisted = _UNLISTED * np.maximum(1.0 - supporters.sum(1, keepdims=True), 0.0)
+    shares = np.concatenate([supporters, unlisted], axis=1)
+    return shares / np.maximum(shares.sum(1, keepdims=True), _LEAST)
 
 
 class Standing(NamedTuple):
@@ -70,8 +83,7 @@ def standing(
     boxes: Boxes,
     floor: float,  # height in metres, or NaN: unknown
     shares: Float[NDArray, "N 3"],  # usual places of each object's class: floor, wall, support
-    supporters: Float[NDArray, "N N"],  # share q of j's class for i's class; structure has 0
-    unlisted: Float[NDArray, " N"],  # share of the supporters that the scene does not list
+    supporters: Float[NDArray, "N+1 N+1"],  # see `shares_in_scene`
     within: Float[NDArray, " N"],  # share k of the things of each object far below its top
 ) -> tuple[Float[NDArray, " N"], Int[NDArray, " N"], Int[NDArray, " N"]]:
     """Return the fields of `Standing`."""
@@ -90,7 +102,7 @@ def standing(
             hung = unheld / 2 + _normal(bottom + extents[i, 2] - floor - HUNG, HUNG_STD) / 2
             unheld *= normal_share(floor + HIGHEST - bottom, s)
         usual = shares[i, 0] * at_floor + shares[i, 1] * hung
-        largest, total, sunk, deepest, near = 0.0, 0.0, below, -1, 0.0
+        largest, total, sunk, deepest, near, strange = 0.0, 0.0, below, -1, 0.0, 0.0
         for j in range(N):
             if i == j or math.isnan(points[j, 2] + extents[j, 0] + extents[j, 1] + extents[j, 2]):
                 continue
@@ -107,6 +119,7 @@ def standing(
             height = max(extents[j, 2], error)
             density = overlap * ((1 - k) * _normal(bottom - top, error) + k * inside / height)
             usual += shares[i, 2] * supporters[i, j] * density
+            strange += supporters[N, j] * density
             lifted = normal_share(bottom - top - LOWEST, error)
             over = max(over, overlap * lifted * min(supporters[i, j] / _USUAL, 1.0))
             total += density
@@ -117,13 +130,15 @@ def standing(
             deep = overlap * normal_share(top - 2 * error - bottom, error) * inside
             if deep > sunk and supporters[i, j] > 0.0:
                 sunk, deepest = deep, j
-        usual += shares[i, 2] * unlisted[i] * (1.0 - _BLOCKED * over) * unheld
-        wrong = np.array(
-            [at_floor, total / max(near, 1.0), (1.0 - below) * uniform, sunk * uniform]
-        )
+        usual += shares[i, 2] * supporters[i, N] * (1.0 - _BLOCKED * over) * unheld
+        strange += supporters[N, N] * unheld
+        wrong = np.array([at_floor, strange, (1.0 - below) * uniform, sunk * uniform])
         for place in range(4):
             wrong[place] *= WRONG[place]
-        reason[i] = wrong.argmax()
+        # An object that touches another one does not float, however rare such a supporter is.
+        shown = wrong.copy()
+        shown[ON_OBJECT] = WRONG[ON_OBJECT] * total / max(near, 1.0)
+        reason[i] = shown.argmax()
         if reason[i] == FLOATS and sunk > 0.5:
             reason[i] = SUNK
         if reason[i] == SUNK:
