@@ -177,7 +177,7 @@ def expected_change(artifact, a, i, j):
     n = dict(zip(PLACES.triple.tolist(), PLACES.triple_scenes.tolist(), strict=True)).get(
         (a * size + i) * size + j, 0.0
     )
-    return 0.5 * prior * 2.0 / (n + 2.0)
+    return 0.25 * prior * 2.0 / (n + 2.0)
 
 
 class ByHand(RelationUnits):

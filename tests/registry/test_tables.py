@@ -255,6 +255,7 @@ def test_supporters_are_smoothed_counts_of_on_top_and_inside() -> None:
     expected = (held + 10 * prior) / (held.sum(1, keepdims=True) + 10)
     assert table.supporters(CLASSES, CLASSES) == pytest.approx(expected)
     assert table.supporters(np.array([1]), np.array([2])) == pytest.approx(expected[1:2, 2:])
+    assert table.any_supporters(np.array([2, 0])) == pytest.approx(prior[[2, 0]])
 
 
 def test_the_roles_tell_under_from_on() -> None:
