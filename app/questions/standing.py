@@ -6,7 +6,8 @@ likelihood of b, per metre (N: normal with the error s, or rarely 3 s):
     floor       N(b; 0, s)
     on or in j  overlap · [(1 - k) · N(b - top of j; 0, s) + k · U(b between bottom and top of j)]
     on or in an object that the scene does not list   U, if b is between `LOWEST` and `HIGHEST`
-    on a wall or at the ceiling   half of that, and half of N(top; `HUNG`, `HUNG_STD`)
+    on a wall or at the ceiling   half of that, and half of N(top; `HUNG`, `HUNG_STD`). Things as
+                                  high as `LONG`, such as curtains, often reach the floor
     floating    U
     sunk in     U, if the box reaches below the floor or into an object
 
@@ -48,13 +49,15 @@ LOWEST: Final = 0.2  # lowest top in metres of an unlisted object on which other
 HIGHEST: Final = 2.0  # highest top in metres of such an object
 HUNG: Final = 2.0  # usual height in metres of the top of an object on a wall
 HUNG_STD: Final = 0.6  # its standard deviation
+LONG: Final = 1.2  # height in metres from which half of the things on a wall reach the floor
+LONG_STD: Final = 0.1  # standard deviation of their bottoms
 _BLOCKED: Final = 0.8  # share of unlisted supports that a usual supporter below rules out
 _USUAL: Final = 0.2  # share q from which a supporter counts fully as usual
 _UNLISTED: Final = 0.3  # share of the unlisted supporters that a scene has
 _LEAST_WITHIN: Final = 0.1  # minimum of k
 _CARRIES: Final = 0.5  # footprint of a supporter, as a share of that on it, that carries fully
 _UNUSUAL: Final = 0.02  # weight of an unusual supporter in the choice of the anchor
-_LARGE, _RARE = 3.0, 0.03  # factor and share of large errors
+_LARGE, _RARE = 3.0, 0.01  # factor and share of large errors
 _LEAST: Final = 1e-6  # minimum of a likelihood
 _SQRT_2_PI: Final = math.sqrt(2.0 * math.pi)
 
@@ -100,6 +103,8 @@ def standing(
             at_floor, below = _normal(bottom - floor, s), normal_share(floor - 2 * s - bottom, s)
             unheld *= normal_share(bottom - floor - LOWEST, s)
             hung = unheld / 2 + _normal(bottom + extents[i, 2] - floor - HUNG, HUNG_STD) / 2
+            if extents[i, 2] >= LONG:
+                hung = (hung + _normal(bottom - floor, max(s, LONG_STD))) / 2
             unheld *= normal_share(floor + HIGHEST - bottom, s)
         usual = shares[i, 0] * at_floor + shares[i, 1] * hung
         largest, total, sunk, deepest, near, strange = 0.0, 0.0, below, -1, 0.0, 0.0
