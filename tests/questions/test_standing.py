@@ -64,9 +64,9 @@ def judge(*placed, floor=0.0, error=ERROR):
 
 
 def normal(distance, s):
-    """The density of an error s, of which 3 % are three times as large."""
+    """The density of an error s, of which 1 % are three times as large."""
     one, three = (math.exp(-0.5 * (distance / k / s) ** 2) / k for k in (1, 3))
-    return (0.97 * one + 0.03 * three) / (s * math.sqrt(2 * math.pi))
+    return (0.99 * one + 0.01 * three) / (s * math.sqrt(2 * math.pi))
 
 
 def share(margin, s):

@@ -124,7 +124,9 @@ def fit_possibility(
         weights = _written_weights()
     else:
         weights = _fit_weights(prior, vocabulary, possible, denied_pairs(encoded, vocabulary))
-    return replace(prior, weights=weights)
+    # Artifacts store tables in half precision.
+    stands, weights = (x.astype(np.float16).astype(np.float32) for x in (prior.stands, weights))
+    return replace(prior, stands=stands, weights=weights)
 
 
 @cache
