@@ -263,15 +263,22 @@ def _posed(model: SceneModel, posterior: Posterior, scene: Scene) -> Iterator[_E
 
 
 def _standing(model: SceneModel, places: Places, scene: Scene, evidence: _Evidence) -> Standing:
-    """Return what the boxes of a scene say. Furniture whose box is only its top reaches down."""
+    """Return what the boxes of a scene say. Furniture whose box is only its top reaches down.
+
+    Such furniture tells where the floor is, if no whole box does.
+    """
     vocabulary, shares = model.vocabulary, evidence.stands
     centres, extents = boxes_of(scene.objects, vocabulary.sizes)
     errors = errors_of(scene.objects, extents, evidence.classes, model.spread)
     usual_height = vocabulary.sizes[evidence.classes, 2]
     is_top = (shares[:, FLOOR] >= USUAL) & (extents[:, 2] < usual_height / 2)
-    bottoms = centres[:, 2] - extents[:, 2] / 2
-    floor = floor_level(bottoms, np.where(is_top, 0.0, shares[:, FLOOR]), errors[:, 1].copy())
-    reached = np.fmax(bottoms + extents[:, 2] - usual_height, floor)
+    bottoms, on_floor = centres[:, 2] - extents[:, 2] / 2, shares[:, FLOOR]
+    reached = bottoms + extents[:, 2] - usual_height
+    std = errors[:, 1].copy()
+    floor = floor_level(bottoms, np.where(is_top, 0.0, on_floor), std)
+    if np.isnan(floor):
+        floor = floor_level(np.where(is_top, reached, bottoms), on_floor.copy(), std)
+    reached = np.fmax(reached, floor)
     longer = np.where(is_top, np.fmax(bottoms - reached, 0.0), 0.0)
     centres[:, 2] -= longer / 2
     extents[:, 2] += longer

@@ -330,6 +330,8 @@ def test_furniture_whose_box_is_only_its_top_reaches_down():
     top = replace(scene.objects[0], position=(0, 0, 0.725), size=(1.6, 0.8, 0.05))
     cut = observe(Scene((top, *scene.objects[1:])))
     assert entries(cut)[ON_TOP, 0, -1][0] == POSED
+    # Alone, the top shows where the floor is.
+    assert entries(observe(Scene((top,))))[ON_TOP, 0, -1][0] == POSED
     pot = replace(top, id="pot", label="pot", class_index=POT)
     table = entries(observe(Scene((pot, *scene.objects[1:]))))
     assert table[ABOVE, 0, -1][0] == UNHELD
