@@ -69,7 +69,7 @@ from app.scene.spatial_relations import (
     SUPPORTS,
     opposite,
 )
-from app.scene.stands import FLOOR, SUPPORTED, USUAL, floor_level
+from app.scene.stands import FLOOR, SUPPORTED, USUAL, floor_level, is_surface
 
 BESIDE, SUPPORT, OVER_IT, BELOW, POSED, HELD, UNHELD = range(len(KINDS))
 """Indices of kinds in `KINDS`. From `POSED` on, entries are about boxes."""
@@ -272,12 +272,16 @@ def _standing(model: SceneModel, places: Places, scene: Scene, evidence: _Eviden
     errors = errors_of(scene.objects, extents, evidence.classes, model.spread)
     usual_height = vocabulary.sizes[evidence.classes, 2]
     is_top = (shares[:, FLOOR] >= USUAL) & (extents[:, 2] < usual_height / 2)
-    bottoms, on_floor = centres[:, 2] - extents[:, 2] / 2, shares[:, FLOOR]
+    bottoms = centres[:, 2] - extents[:, 2] / 2
     reached = bottoms + extents[:, 2] - usual_height
     std = errors[:, 1].copy()
-    floor = floor_level(bottoms, np.where(is_top, 0.0, on_floor), std)
+    on_floor = np.ascontiguousarray(shares[:, FLOOR])
+    whole = np.where(is_top, np.nan, bottoms)
+    floor = floor_level(whole, on_floor, std)
     if np.isnan(floor):
-        floor = floor_level(np.where(is_top, reached, bottoms), on_floor.copy(), std)
+        floor = floor_level(np.where(is_top, reached, bottoms), on_floor, std)
+    elif is_surface(floor, whole, on_floor, std):
+        floor = np.nan
     reached = np.fmax(reached, floor)
     longer = np.where(is_top, np.fmax(bottoms - reached, 0.0), 0.0)
     centres[:, 2] -= longer / 2

@@ -44,18 +44,44 @@ def floor_level(
     """
     likeliest, level = -math.inf, math.nan
     for f in range(len(bottoms)):
-        if not (math.isfinite(bottoms[f]) and shares[f] >= USUAL):
-            continue
-        log_p = 0.0
-        for i in range(len(bottoms)):
-            error, distance = max(errors[i], _SMALLEST), bottoms[i] - bottoms[f]
-            if not math.isnan(distance):
-                p = shares[i] * math.exp(-0.5 * (distance / error) ** 2) / (error * _SQRT_2_PI)
-                p += _UNIFORM * ((1.0 - shares[i]) * (distance >= -error) + _ERROR)
-                log_p += math.log(p)
-        if log_p > likeliest:
-            likeliest, level = log_p, bottoms[f]
+        if math.isfinite(bottoms[f]) and shares[f] >= USUAL:
+            log_p, _ = _log_likelihoods(bottoms[f], bottoms, shares, errors)
+            if log_p > likeliest:
+                likeliest, level = log_p, bottoms[f]
     return level
+
+
+@compiled
+def is_surface(
+    level: float,
+    bottoms: Float[NDArray, " n"],
+    shares: Float[NDArray, " n"],
+    errors: Float[NDArray, " n"],
+) -> bool:
+    """Return whether a surface at this height, such as a table top, explains n boxes best.
+
+    A robot that sees a plant, a fork and a spoon at one height sees no floor. The surface has each
+    box with the share H = (1 - S) / 2, so its log-likelihood is, in the terms of `floor_level`,
+
+        Σ log( H · N(bottom - f; 0, s) + (H + S · [bottom < f - s] + `_ERROR`) · U )
+    """
+    floor, surface = _log_likelihoods(level, bottoms, shares, errors)
+    return surface > floor
+
+
+@compiled
+def _log_likelihoods(level, bottoms, shares, errors):
+    """Return the log-likelihoods of a floor and of a surface above it at this height."""
+    floor, surface = 0.0, 0.0
+    for i in range(len(bottoms)):
+        error, distance = max(errors[i], _SMALLEST), bottoms[i] - level
+        if not math.isnan(distance):
+            near = math.exp(-0.5 * (distance / error) ** 2) / (error * _SQRT_2_PI)
+            above = (1.0 - shares[i]) * (distance >= -error)
+            floor += math.log(shares[i] * near + _UNIFORM * (above + _ERROR))
+            half, below = (1.0 - shares[i]) / 2, shares[i] * (distance < -error)
+            surface += math.log(half * near + _UNIFORM * (half + below + _ERROR))
+    return floor, surface
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,16 @@ from app.scene.spatial_relations import (
     opposite,
     support_cycle,
 )
-from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN, Heights, floor_level, stands_of
+from app.scene.stands import (
+    FLOOR,
+    HANGS,
+    SUPPORTED,
+    UNKNOWN,
+    Heights,
+    floor_level,
+    is_surface,
+    stands_of,
+)
 from scene_client.frames import (
     METRES,
     Conventions,
@@ -250,6 +259,20 @@ def test_the_likelihood_of_a_floor_is_that_of_a_hand_computation() -> None:
     # A shelf that hardly ever stands on the floor is no candidate.
     shares[0] = 0.49
     assert floor_level(bottoms, shares, errors) == 0.4
+
+
+def test_a_table_top_is_not_the_floor() -> None:
+    """A plant usually stands on the floor, but not beside a fork and a spoon at one height."""
+    bottoms, errors = np.full(3, 0.8), np.full(3, 0.05)
+    assert is_surface(0.8, bottoms, np.array([0.6, 0.01, 0.01]), errors)
+    # Two chairs at this height are on the floor, and the spoon has fallen.
+    assert not is_surface(0.8, bottoms, np.array([0.98, 0.98, 0.01]), errors)
+    # A bin .8 m below a plant alone: by hand.
+    shares, peak = np.array([0.6, 0.9]), 1 / (0.05 * math.sqrt(2 * math.pi))
+    floor = math.log(0.6 * peak + 0.4 * (0.4 + 0.05)) + math.log(0.4 * 0.05)
+    surface = math.log(0.2 * peak + 0.4 * (0.2 + 0.05)) + math.log(0.4 * (0.05 + 0.9 + 0.05))
+    assert surface > floor
+    assert is_surface(0.8, np.array([0.8, 0.0]), shares, errors[:2])
 
 
 def test_a_certain_box_outweighs_an_uncertain_one() -> None:
