@@ -30,7 +30,11 @@ AT_FLOOR, AT_WALL, AT_CEILING, AT_SURFACE, AT_INSIDE = range(5)
 """Columns of `Possibility.stands`: where things stand."""
 
 SURFACE, CONTAINER, CARRIED = range(3)
-"""Columns of `Possibility.traits`: 0 no, .5 sometimes, 1 yes; 0 one hand to 3 nobody carries it."""
+"""Columns of `Possibility.traits`.
+
+The first two have 0 for no, .5 for sometimes and 1 for yes. The third one has 0 for one hand, 1 for
+two hands, 2 for several people and 3 for nobody.
+"""
 
 UNKNOWN: Final = -1.0  # surface of a class without a description
 
