@@ -26,8 +26,9 @@ The log-odds that an entry is wrong are a weighted sum of six terms (`app.model.
     l   log of the number of entries, because hardly more than one entry of a scene is wrong
 
 k = n / (n + 2) is the share of the log-odds that n training scenes with the relation show. z, d, q
-and u are those of the support, and 0 for other kinds with boxes. Classes that belong everywhere,
-such as pets and bags, have s = q = 0, and only their supports are judged.
+and u of boxes are r times those of the support (`app.questions.standing`), and 0 for other kinds
+with boxes. Classes that belong everywhere, such as pets and bags, have s = q = 0, and only their
+supports are judged.
 
 A relation that a person has confirmed (`app.model.Misplaced.confirmed`) has z = `EXPLAINED` and
 d = s = q = u = 0, because its place may be rare for the class.
@@ -69,7 +70,7 @@ from app.scene.spatial_relations import (
     SUPPORTS,
     opposite,
 )
-from app.scene.stands import FLOOR, SUPPORTED, USUAL, floor_level, is_surface
+from app.scene.stands import FLOOR, SUPPORTED, USUAL, floor_level
 
 BESIDE, SUPPORT, OVER_IT, BELOW, POSED, HELD, UNHELD = range(len(KINDS))
 """Indices of kinds in `KINDS`. From `POSED` on, entries are about boxes."""
@@ -253,7 +254,8 @@ def _posed(model: SceneModel, posterior: Posterior, scene: Scene) -> Iterator[_E
         if evidence.classes[i] == evidence.classes[j]:
             continue  # a stack of one class, as in `_stated`
         a = INSIDE if (INSIDE, i, j) in holding else ON_TOP
-        (z, u), d, q = evidence.support(a, i, j), evidence.d(a, i, j), evidence.q(i, j)
+        r, (z, u) = at.held[i], evidence.support(a, i, j)
+        z, d, q, u = r * z, r * evidence.d(a, i, j), r * evidence.q(i, j), r * u
         s = -at.log_ratio[i]
         if not evidence.moves[i]:
             s = q = 0.0
@@ -280,8 +282,6 @@ def _standing(model: SceneModel, places: Places, scene: Scene, evidence: _Eviden
     floor = floor_level(whole, on_floor, std)
     if np.isnan(floor):
         floor = floor_level(np.where(is_top, reached, bottoms), on_floor, std)
-    elif is_surface(floor, whole, on_floor, std):
-        floor = np.nan
     reached = np.fmax(reached, floor)
     longer = np.where(is_top, np.fmax(bottoms - reached, 0.0), 0.0)
     centres[:, 2] -= longer / 2

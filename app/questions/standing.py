@@ -1,27 +1,32 @@
 """What holds an object with a box: is the box explained by the usual places of its class?
 
 Let b be the bottom of the box of an object above the floor, with the error s. Each place has a
-likelihood of b, per metre (N: normal with the error s, or rarely 3 s):
+likelihood of b, per metre (N: normal with the error s, or rarely 3 s; U: 1 / `ROOM`):
 
     floor       N(b; 0, s)
     on or in j  overlap · [(1 - k) · N(b - top of j; 0, s) + k · U(b between bottom and top of j)]
-    on or in an object that the scene does not list   U, if b is between `LOWEST` and `HIGHEST`
-    on a wall or at the ceiling   half of that, and half of N(top; `HUNG`, `HUNG_STD`). Things as
+    on or in an object that the scene does not list   if b is between `LOWEST` and `HIGHEST`:
+                (U + Σ S_j N(b - bottom of j; 0, s)) / (1 + Σ S_j), summed over the objects j within
+                `NEAR`, because things on one counter have one height; U if a listed object is there
+    on a wall or at the ceiling   half of U, and half of N(top; `HUNG`, `HUNG_STD`). Things as
                                   high as `LONG`, such as curtains, often reach the floor
     floating    U
     sunk in     U, if the box reaches below the floor or into an object
 
-Things at wrong places are on or in the supporters of any things. U is 1 / `ROOM` per metre. k is
-the share of things far below the top of such an object: on a seat,
-or on the boards of a shelf (`Places.within`). The usual places of the class have the shares
-S of floor, wall and support, and q of its supporters. An object above a usual supporter is hardly
-on an unlisted object. Objects at wrong places have the shares `WRONG`. The evidence of a wrong
-place is the log ratio
+Things at wrong places are on or in the supporters of any things, or on the floor where no object
+has its inside. k is the share of things far below the top of such an object: on a seat, or on the
+boards of a shelf (`Places.within`). The usual places of the class have the shares S of floor, wall
+and support, and q of its supporters. An object above a usual supporter is not on an unlisted
+object. Objects at wrong places have the shares `WRONG`. The evidence of a wrong place is the log
+ratio
 
     t = log Σ wrong share · likelihood - log Σ usual share · likelihood
 
 So an object is at a wrong place only if no usual place explains its box within the errors. A box
 that probably reaches into an object does not float.
+
+The judgement of a wrong support also asks how likely a relation of the two classes is. It counts
+with the probability r that the object is on or in the other one, and not at another usual place.
 """
 
 import math
@@ -51,12 +56,13 @@ HUNG: Final = 2.0  # usual height in metres of the top of an object on a wall
 HUNG_STD: Final = 0.6  # its standard deviation
 LONG: Final = 1.2  # height in metres from which half of the things on a wall reach the floor
 LONG_STD: Final = 0.1  # standard deviation of their bottoms
-_BLOCKED: Final = 0.8  # share of unlisted supports that a usual supporter below rules out
+NEAR: Final = 1.0  # distance in metres of objects that may be on the same unlisted object
 _USUAL: Final = 0.2  # share q from which a supporter counts fully as usual
 _UNLISTED: Final = 0.3  # share of the unlisted supporters that a scene has
 _LEAST_WITHIN: Final = 0.1  # minimum of k
 _CARRIES: Final = 0.5  # footprint of a supporter, as a share of that on it, that carries fully
 _UNUSUAL: Final = 0.02  # weight of an unusual supporter in the choice of the anchor
+_LEAST_OVERLAP: Final = 0.05  # probability of an overlap from which an object may hold another
 _LARGE, _RARE = 3.0, 0.01  # factor and share of large errors
 _LEAST: Final = 1e-6  # minimum of a likelihood
 _SQRT_2_PI: Final = math.sqrt(2.0 * math.pi)
@@ -79,6 +85,7 @@ class Standing(NamedTuple):
     log_ratio: Float[Floats, "N"]  # t; 0 without a box
     reason: Int[Indices, "N"]  # the likeliest wrong place; -1 without a box
     anchor: Int[Indices, "N"]  # the object at the likeliest wrong place, or -1
+    held: Float[Floats, "N"]  # r of the object that holds each object most likely
 
 
 @compiled
@@ -88,11 +95,11 @@ def standing(
     shares: Float[NDArray, "N 3"],  # usual places of each object's class: floor, wall, support
     supporters: Float[NDArray, "N+1 N+1"],  # see `shares_in_scene`
     within: Float[NDArray, " N"],  # share k of the things of each object far below its top
-) -> tuple[Float[NDArray, " N"], Int[NDArray, " N"], Int[NDArray, " N"]]:
+) -> tuple[Float[NDArray, " N"], Int[NDArray, " N"], Int[NDArray, " N"], Float[NDArray, " N"]]:
     """Return the fields of `Standing`."""
     points, extents, _, errors = boxes
     N, uniform = len(points), 1.0 / ROOM
-    log_ratio, reason, anchor = np.zeros(N), np.full(N, -1), np.full(N, -1)
+    log_ratio, reason, anchor, held = np.zeros(N), np.full(N, -1), np.full(N, -1), np.zeros(N)
     for i in range(N):
         bottom = points[i, 2] - extents[i, 2] / 2
         if math.isnan(bottom + extents[i, 0] + extents[i, 1]):
@@ -108,35 +115,46 @@ def standing(
             unheld *= normal_share(floor + HIGHEST - bottom, s)
         usual = shares[i, 0] * at_floor + shares[i, 1] * hung
         largest, total, sunk, deepest, near, strange = 0.0, 0.0, below, -1, 0.0, 0.0
+        of_anchor, usual_anchor, beside, level, carried, enclosed = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for j in range(N):
             if i == j or math.isnan(points[j, 2] + extents[j, 0] + extents[j, 1] + extents[j, 2]):
                 continue
-            overlap = _overlap(boxes, i, j)
-            if overlap < 0.05:
-                continue
-            top, k = points[j, 2] + extents[j, 2] / 2, max(within[j], _LEAST_WITHIN)
             error = max(math.hypot(s, errors[j, 1]), SMALLEST_STD)
-            inside = normal_share(top - bottom, error) * normal_share(
-                bottom - top + extents[j, 2], error
-            )
-            carries = extents[j, 0] * extents[j, 1] / max(extents[i, 0] * extents[i, 1], 1e-9)
-            overlap *= min(carries / _CARRIES, 1.0)
-            height = max(extents[j, 2], error)
-            density = overlap * ((1 - k) * _normal(bottom - top, error) + k * inside / height)
-            usual += shares[i, 2] * supporters[i, j] * density
+            lift = bottom - points[j, 2] - extents[j, 2] / 2
+            if math.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1]) < NEAR:
+                beside += shares[j, 2]
+                level += shares[j, 2] * _normal(lift + extents[j, 2], error)
+            overlap = _overlap(boxes, i, j)
+            if overlap < _LEAST_OVERLAP:
+                continue
+            # Only a thick object tells things on it from things beside it.
+            thick = 1.0 - math.exp(-0.5 * (extents[j, 2] / error) ** 2)
+            carried = max(carried, overlap * thick * math.exp(-0.5 * (lift / error) ** 2))
+            area = extents[j, 0] * extents[j, 1] / max(extents[i, 0] * extents[i, 1], 1e-9)
+            overlap *= min(area / _CARRIES, 1.0)
+            inside = normal_share(-lift, error) * normal_share(lift + extents[j, 2], error)
+            k = max(within[j], _LEAST_WITHIN)
+            enclosed = max(enclosed, overlap * inside * k)
+            uniform_in = inside / max(extents[j, 2], error)
+            density = overlap * ((1 - k) * _normal(lift, error) + k * uniform_in)
+            usual_at = shares[i, 2] * supporters[i, j] * density
+            usual += usual_at
             strange += supporters[N, j] * density
-            lifted = normal_share(bottom - top - LOWEST, error)
+            lifted = normal_share(lift - LOWEST, error)
             over = max(over, overlap * lifted * min(supporters[i, j] / _USUAL, 1.0))
             total += density
             near += overlap
             likely = density * (supporters[i, j] + _UNUSUAL)
             if likely > largest:
-                largest, anchor[i] = likely, j
-            deep = overlap * normal_share(top - 2 * error - bottom, error) * inside
+                largest, anchor[i], of_anchor, usual_anchor = likely, j, density, usual_at
+            deep = overlap * normal_share(-lift - 2 * error, error) * inside
             if deep > sunk and supporters[i, j] > 0.0:
                 sunk, deepest = deep, j
-        usual += shares[i, 2] * supporters[i, N] * (1.0 - _BLOCKED * over) * unheld
+        shared = (1.0 + level / uniform) / (1.0 + beside)
+        unheld *= carried + (1.0 - carried) * shared
+        usual += shares[i, 2] * supporters[i, N] * (1.0 - over) * unheld
         strange += supporters[N, N] * unheld
+        at_floor *= 1.0 - enclosed
         wrong = np.array([at_floor, strange, (1.0 - below) * uniform, sunk * uniform])
         for place in range(4):
             wrong[place] *= WRONG[place]
@@ -150,8 +168,10 @@ def standing(
             anchor[i] = deepest
         elif reason[i] != ON_OBJECT:
             anchor[i] = -1
+        of_anchor *= WRONG[ON_OBJECT] / max(near, 1.0)
+        held[i] = of_anchor / max(of_anchor + usual - usual_anchor, _LEAST)
         log_ratio[i] = math.log(max(wrong.sum(), _LEAST) / max(usual, _LEAST))
-    return log_ratio, reason, anchor
+    return log_ratio, reason, anchor, held
 
 
 @compiled

@@ -32,41 +32,29 @@ _SQRT_2_PI: Final = math.sqrt(2 * math.pi)
 def floor_level(
     bottoms: Float[NDArray, " n"], shares: Float[NDArray, " n"], errors: Float[NDArray, " n"]
 ) -> float:
-    """Return the likeliest height of the floor in metres, among the bottoms of n boxes.
+    """Return the likeliest height of the floor in metres, among the bottoms of n boxes, or NaN.
 
     The bottom of a box is at the floor f with the share S of its class, with a normal error s, or
     else above it. Boxes below the floor are errors. So f maximises
 
         Σ log( S · N(bottom - f; 0, s) + (1 - S) · U · [bottom ≥ f - s] + `_ERROR` · U )
 
-    with U = .4 per metre.
-    Boxes with S below `USUAL` are no candidates. Without any candidate, the height is NaN.
+    with U = .4 per metre. Boxes with S below `USUAL` are no candidates.
+
+    A robot that sees a plant, a fork and a spoon at one height sees a table top, and no floor. A
+    surface at the height f has each box with the share H = (1 - S) / 2, so its log-likelihood is
+
+        Σ log( H · N(bottom - f; 0, s) + (H + S · [bottom < f - s] + `_ERROR`) · U )
+
+    The height is NaN if this is larger than that of the floor, or without any candidate.
     """
     likeliest, level = -math.inf, math.nan
     for f in range(len(bottoms)):
         if math.isfinite(bottoms[f]) and shares[f] >= USUAL:
-            log_p, _ = _log_likelihoods(bottoms[f], bottoms, shares, errors)
-            if log_p > likeliest:
-                likeliest, level = log_p, bottoms[f]
+            floor, surface = _log_likelihoods(bottoms[f], bottoms, shares, errors)
+            if floor > likeliest:
+                likeliest, level = floor, bottoms[f] if floor >= surface else math.nan
     return level
-
-
-@compiled
-def is_surface(
-    level: float,
-    bottoms: Float[NDArray, " n"],
-    shares: Float[NDArray, " n"],
-    errors: Float[NDArray, " n"],
-) -> bool:
-    """Return whether a surface at this height, such as a table top, explains n boxes best.
-
-    A robot that sees a plant, a fork and a spoon at one height sees no floor. The surface has each
-    box with the share H = (1 - S) / 2, so its log-likelihood is, in the terms of `floor_level`,
-
-        Σ log( H · N(bottom - f; 0, s) + (H + S · [bottom < f - s] + `_ERROR`) · U )
-    """
-    floor, surface = _log_likelihoods(level, bottoms, shares, errors)
-    return surface > floor
 
 
 @compiled

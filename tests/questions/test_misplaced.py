@@ -27,7 +27,7 @@ from app.questions.misplaced import (
     wrong_relations,
 )
 from app.questions.posterior import present
-from app.questions.standing import shares_in_scene, standing
+from app.questions.standing import ON_FLOOR, WRONG, Standing, shares_in_scene, standing
 from app.scene import ObjectClass, RelationTable, Scene, SceneObject, Vocabulary, observe
 from app.scene.scene import errors_of
 from app.scene.spatial_relations import ABOVE, INSIDE, LEFT, ON_TOP
@@ -228,7 +228,7 @@ def test_the_stand_of_classes_that_belong_everywhere_is_not_judged():
     held = posed((BIN, (0, 0, 0.75)), (DESK, (0, 0, 0)))
     _, terms, _ = entries(held, {(ON_TOP, 0, 1): -2.0}, artifact=artifact)[ON_TOP, 0, 1]
     # Words say that the bin is under the desk, and none that it is on it.
-    assert terms == [-2.0, 0.0, 0.0, 0.0, 0.0]
+    assert terms == pytest.approx([-2.0 * evidence(held).held[0], 0.0, 0.0, 0.0, 0.0])
 
 
 def test_a_supported_object_above_another_is_not_misplaced():
@@ -259,18 +259,18 @@ def test_a_confirmed_support_has_no_other_evidence(is_posed):
 # ------------------------------------------------------------------------------------------ boxes
 
 
-def evidence(scene, floor=0.0):
-    """The log ratio of each object of a scene with boxes, without classes of one another."""
+def evidence(scene, floor=0.0, places=PLACES):
+    """The evidence about each object of a scene with boxes, with the terms t and r."""
     classes = np.array([thing.class_index for thing in scene.objects])
     centres = np.array([thing.position for thing in scene.objects])
     sizes = np.array([thing.size for thing in scene.objects])
-    of_any = PLACES.any_supporters(classes)[None]
-    supporters = np.concatenate([PLACES.supporters(classes, classes), of_any])
+    of_any = places.any_supporters(classes)[None]
+    supporters = np.concatenate([places.supporters(classes, classes), of_any])
     supporters[:, classes == WALL] = 0.0
     errors = errors_of(scene.objects, sizes, classes, None)
     boxes = centres, sizes, np.zeros(len(classes)), errors
-    stands, within = np.array(STANDS)[classes], PLACES.within[classes].astype(float)
-    return standing(boxes, floor, stands, shares_in_scene(supporters), within)[0]
+    stands, within = np.array(STANDS)[classes], places.within[classes].astype(float)
+    return Standing(*standing(boxes, floor, stands, shares_in_scene(supporters), within))
 
 
 BESIDE_IT = (9.0, 0.0, 0.0)
@@ -296,17 +296,64 @@ def test_each_box_has_one_entry_with_its_likeliest_wrong_place(thing, other, tri
     assert {i for _, i, _ in table} == set(range(len(scene.objects)))
     found, (z, d, s, q, u), mover = table[triple]
     assert (found, mover) == (kind, 0)
-    assert s == pytest.approx(-evidence(scene)[0], abs=1e-6)
+    found = evidence(scene)
+    assert s == pytest.approx(-found.log_ratio[0], abs=1e-6)
     if kind == HELD:
-        assert (z, d, u) == (-1.0, 0.75, 0.0)
-        classes = np.array([thing[0]]), np.array([other[0]])
-        assert q == pytest.approx(math.log(PLACES.supporters(*classes)[0, 0]))
+        classes, r = (np.array([thing[0]]), np.array([other[0]])), found.held[0]
+        log_q = math.log(PLACES.supporters(*classes)[0, 0])
+        assert (z, d, q, u) == pytest.approx((-r, 0.75 * r, log_q * r, 0.0), abs=1e-6)
+        assert r > 0.8
     else:
         assert (z, d, q, u) == (0, 0, 0, 0)
     answer = {entry["moved"]: entry for entry in fields_of(scene, judgements=EVERY)}
     entry = answer[NAMES[thing[0]]]
     assert entry["reason"] == reason
     assert entry["object"] == (NAMES[other[0]] if triple[2] >= 0 else THE_FLOOR)
+
+
+def test_things_beside_one_another_share_an_unlisted_supporter():
+    """A pot at .9 m, and a monitor beside it at the same height: by hand."""
+    things = posed((POT, (0, 0, 0.9)), (MONITOR, (0.5, 0, 0.9))).objects
+    classes = np.array([POT, MONITOR])
+    (s, other), share = (
+        errors_of(things, np.array([SIZES[c] for c in classes]), classes, None)[:, 1],
+        STANDS[MONITOR][2],
+    )
+
+    def density(distance, error):
+        narrow, wide = (math.exp(-0.5 * (distance / x) ** 2) / x for x in (error, 3 * error))
+        return (0.99 * narrow + 0.01 * wide) / math.sqrt(2 * math.pi)
+
+    uniform = 1 / 2.5
+    level = density(0, math.hypot(s, other))
+    unlisted = (uniform + share * level) / (1 + share)
+    hung = uniform / 2 + density(1.1 - 2.0, 0.6) / 2
+    rows = [PLACES.supporters(classes, classes)[0], PLACES.any_supporters(classes)]
+    usual_share, any_share = shares_in_scene(np.array(rows))[:, -1]
+    _, wall, support = STANDS[POT]
+    usual = wall * hung + support * usual_share * unlisted
+    wrong = WRONG[1] * any_share * unlisted + WRONG[2] * uniform
+    assert evidence(Scene(things)).log_ratio[0] == pytest.approx(math.log(wrong / usual), rel=1e-4)
+    # Without a common height, nothing supports the unlisted supporter.
+    lower = replace(things[1], position=(0.5, 0, 0.6))
+    assert evidence(Scene((things[0], lower))).log_ratio[0] > math.log(wrong / usual)
+
+
+def test_a_relation_counts_as_far_as_the_object_is_at_the_other_one():
+    """A pot on the sofa is on it. A pot that reaches over its edge may be on something beside."""
+    on, beside = (
+        evidence(posed((POT, (0, y, 0.8)), (SOFA, (0, 0, 0)), (MONITOR, (0, y + 0.5, 0.8)))).held[0]
+        for y in (0.0, 0.54)
+    )
+    assert 0 < beside < 0.5 < on < 1
+
+
+def test_the_inside_of_a_container_is_not_the_floor():
+    places = replace(PLACES, within=np.where(np.arange(V) == SHELF, 0.95, 0.1).astype(np.float32))
+    scene = posed((MONITOR, (0, 0, 0.02)), (SHELF, (0, 0, 0)), (STOVE, (9, 0, 0)))
+    inside, on_floor = evidence(scene, places=places), evidence(scene)
+    assert on_floor.reason[0] == ON_FLOOR
+    assert inside.log_ratio[0] < on_floor.log_ratio[0] - 0.5
 
 
 def test_a_thing_in_a_listed_container_is_inside_it():
@@ -320,7 +367,8 @@ def test_a_thing_in_a_listed_container_is_inside_it():
     scene = posed((SHELF, (0, 0, 0)), (POT, (0, 0, 0.9)), artifact=artifact)
     table = entries(scene, {(INSIDE, 1, 0): 0.5}, artifact=artifact)
     assert table[INSIDE, 1, 0][:1] == (HELD,)
-    assert table[INSIDE, 1, 0][1][0] == 0.5
+    r = evidence(scene, places=artifact.places).held[1]
+    assert table[INSIDE, 1, 0][1][0] == pytest.approx(0.5 * r)
 
 
 def test_furniture_whose_box_is_only_its_top_reaches_down():
@@ -386,7 +434,7 @@ def test_the_log_odds_are_a_weighted_sum_of_the_terms():
 def test_the_answer_has_the_probability_of_the_judgement():
     scene = posed((MONITOR, (4, 0, 0)), (DESK, (0, 0, 0)))
     (entry,) = (e for e in fields_of(scene, judgements=EVERY) if e["moved"] == "monitor")
-    t = evidence(scene)[0]
+    t = evidence(scene).log_ratio[0]
     assert entry == {
         "subject": "monitor",
         "relation": "on-top",
@@ -414,7 +462,7 @@ def test_boxes_on_the_floor_are_listed_above_the_line_or_the_least_probability(s
     """The lines are at the odds e, e² and e³."""
     things = [(c, (4.0 * c, 0, 0)) for c in (DESK, MONITOR, BIN, POT, SOFA)]
     scene = posed(*things)
-    t, line = evidence(scene), {"low": 3, "medium": 2, "high": 1}[sensitivity]
+    t, line = evidence(scene).log_ratio, {"low": 3, "medium": 2, "high": 1}[sensitivity]
     p = {thing.id: 1 / (1 + math.exp(-x)) for thing, x in zip(scene.objects, t, strict=True)}
     answer = fields_of(scene, sensitivity=sensitivity)
     expected = sorted((x for x in p if p[x] >= LEAST_LISTED), key=p.__getitem__, reverse=True)

@@ -32,7 +32,6 @@ from app.scene.stands import (
     UNKNOWN,
     Heights,
     floor_level,
-    is_surface,
     stands_of,
 )
 from scene_client.frames import (
@@ -256,23 +255,24 @@ def test_the_likelihood_of_a_floor_is_that_of_a_hand_computation() -> None:
     high = math.log(0.4 * 0.05) + math.log(0.55 * peak + 0.4 * (0.45 + 0.05))
     assert low > high
     assert floor_level(bottoms, shares, errors) == 0.0
-    # A shelf that hardly ever stands on the floor is no candidate.
+    # A shelf that hardly ever stands on the floor is no candidate, and the pot stands above it.
     shares[0] = 0.49
-    assert floor_level(bottoms, shares, errors) == 0.4
+    assert math.isnan(floor_level(bottoms, shares, errors))
 
 
 def test_a_table_top_is_not_the_floor() -> None:
     """A plant usually stands on the floor, but not beside a fork and a spoon at one height."""
     bottoms, errors = np.full(3, 0.8), np.full(3, 0.05)
-    assert is_surface(0.8, bottoms, np.array([0.6, 0.01, 0.01]), errors)
+    assert math.isnan(floor_level(bottoms, np.array([0.6, 0.01, 0.01]), errors))
     # Two chairs at this height are on the floor, and the spoon has fallen.
-    assert not is_surface(0.8, bottoms, np.array([0.98, 0.98, 0.01]), errors)
-    # A bin .8 m below a plant alone: by hand.
-    shares, peak = np.array([0.6, 0.9]), 1 / (0.05 * math.sqrt(2 * math.pi))
-    floor = math.log(0.6 * peak + 0.4 * (0.4 + 0.05)) + math.log(0.4 * 0.05)
-    surface = math.log(0.2 * peak + 0.4 * (0.2 + 0.05)) + math.log(0.4 * (0.05 + 0.9 + 0.05))
+    assert floor_level(bottoms, np.array([0.98, 0.98, 0.01]), errors) == 0.8
+    # A plant beside a spoon, by hand.
+    shares, peak = np.array([0.6, 0.01]), 1 / (0.05 * math.sqrt(2 * math.pi))
+    floor = math.log(0.6 * peak + 0.4 * (0.4 + 0.05)) + math.log(0.01 * peak + 0.4 * (0.99 + 0.05))
+    surface = math.log(0.2 * peak + 0.4 * (0.2 + 0.05))
+    surface += math.log(0.495 * peak + 0.4 * (0.495 + 0.05))
     assert surface > floor
-    assert is_surface(0.8, np.array([0.8, 0.0]), shares, errors[:2])
+    assert math.isnan(floor_level(bottoms[:2], shares, errors[:2]))
 
 
 def test_a_certain_box_outweighs_an_uncertain_one() -> None:
@@ -292,7 +292,7 @@ def test_the_floor_is_the_bottom_of_a_candidate(boxes):
     bottoms, shares, errors = np.array(boxes).T.copy()
     level = floor_level(bottoms, shares, errors)
     candidates = bottoms[shares >= 0.5]
-    assert level in candidates if len(candidates) else math.isnan(level)
+    assert math.isnan(level) or level in candidates
 
 
 def test_the_floor_is_unknown_without_objects_that_stand_on_it() -> None:

@@ -138,12 +138,15 @@ def _supports(encoded: EncodedScene) -> Bool[NDArray, "N N"]:
 
 
 def _strangers(encoded: EncodedScene) -> Bool[NDArray, "N N"]:
-    """Return the pairs of instances whose classes never support each other in the scene."""
+    """Return the pairs of instances of two classes that never support each other in the scene.
+
+    Things of one class are no strangers, because a cookie on a cookie is right.
+    """
     classes, row = np.unique(encoded.instance_classes, return_inverse=True)
-    related = np.zeros((len(classes), len(classes)), dtype=np.bool_)
+    related = np.eye(len(classes), dtype=np.bool_)
     i, j = np.nonzero(_supports(encoded))
     related[row[i], row[j]] = related[row[j], row[i]] = True
-    return np.logical_not(related[row[:, None], row]) & ~np.eye(len(row), dtype=np.bool_)
+    return np.logical_not(related[row[:, None], row])
 
 
 def moved_by_pose(

@@ -34,7 +34,7 @@ from app.questions.misplaced import (
 )
 from app.questions.posterior import Posterior
 from app.scene import RelationTable, Scene
-from app.scene.scene import observe
+from app.scene.scene import boxes_of, observe
 from app.scene.spatial_relations import ON_TOP
 from training.datasets import EncodedScene
 from training.datasets.array_types import Rng, Table
@@ -172,9 +172,9 @@ def _questions(
         part = _part_of(untouched, scene_rng(encoded, seed + 2))
         cases: list[tuple[Scene, int | None]] = [(untouched, None), (part, None), moved]
         if has_boxes(encoded):
-            cases.append(_part_with(*moved, scene_rng(encoded, seed + 2)))
+            cases.append(_part_near(*moved, scene_rng(encoded, seed + 2)))
             if case := lifted_or_sunk(encoded, structure, scene_rng(encoded, seed + 3)):
-                cases += [case, _part_with(*case, scene_rng(encoded, seed + 5))]
+                cases += [case, _part_near(*case, scene_rng(encoded, seed + 5))]
         for shown, wrong in cases:
             yield observe(shown, typical_sizes=sizes, spread=spread, roles=roles), wrong
 
@@ -186,22 +186,24 @@ def _stating(scene: Scene, triples: Sequence[Triple], unders: Collection[Triple]
 
 
 def _part_of(scene: Scene, rng: Rng) -> Scene:
-    """Return a random part of the objects, as a view; with stated relations, the whole scene."""
+    """Return the objects near a random one, as a view; with stated relations, the whole scene."""
     if scene.relations is not None:
         return scene
-    count = int(rng.integers(1, len(scene.objects) + 1))
-    kept = np.sort(rng.permutation(len(scene.objects))[:count])
-    return replace(scene, objects=tuple(scene.objects[k] for k in kept))
+    part, _ = _part_near(scene, int(rng.integers(len(scene.objects))), rng)
+    return part
 
 
-def _part_with(scene: Scene, moved: int, rng: Rng) -> tuple[Scene, int]:
-    """Return a random part of a scene with boxes, with the moved object, and its index."""
-    chosen = rng.random(len(scene.objects)) < rng.uniform()
-    chosen[moved] = True
-    objects = tuple(
-        thing for thing, is_chosen in zip(scene.objects, chosen, strict=True) if is_chosen
-    )
-    return replace(scene, objects=objects), int(chosen[:moved].sum())
+def _part_near(scene: Scene, i: int, rng: Rng) -> tuple[Scene, int]:
+    """Return the objects nearest to object i, which a robot sees at once, and its index there.
+
+    The logarithm of their number is uniform, because many views show few objects.
+    """
+    points, _ = boxes_of(scene.objects, None)
+    distance = np.linalg.norm(points - points[i], axis=1)  # objects without a position come last
+    distance[i] = -1.0
+    count = round(len(points) ** rng.uniform())
+    kept = np.sort(np.argsort(distance, kind="stable")[:count]).tolist()
+    return replace(scene, objects=tuple(scene.objects[k] for k in kept)), kept.index(i)
 
 
 def _truth(
