@@ -15,7 +15,7 @@ from app.inference.chains import SceneChains
 from app.inference.objects import ObjectScorer
 from app.inference.relation_units import RelationUnits, StandIns, relation_units
 from app.model.calibration import Calibration, RelationSlopes
-from app.model.possibility import Possibility, UnitsWithPrior
+from app.model.possibility import CONTAINER, Possibility, UnitsWithPrior
 from app.model.statistics import Counts, Offsets, Places
 from app.model.word_weights import RowMap
 from app.scene.roles import RoleCounts
@@ -56,6 +56,13 @@ class SceneModel:
     def spread(self) -> Float[NDArray[np.float32], "V"] | None:
         """Standard deviations of the log of the sizes of the classes."""
         return None if self.possibility is None else self.possibility.spread
+
+    @cached_property
+    def containers(self) -> Float[NDArray[np.float64], "V"]:
+        """Whether each class is a container: 1, sometimes (.5), or 0; 0 without a description."""
+        if self.possibility is None:
+            return np.zeros(self.spec.V)
+        return np.maximum(self.possibility.traits[:, CONTAINER], 0.0).astype(np.float64)
 
     @cached_property
     def spec(self) -> MachineSpec:

@@ -291,7 +291,13 @@ def _standing(model: SceneModel, places: Places, scene: Scene, evidence: _Eviden
     in_scene = shares_in_scene(np.concatenate([evidence.supporters, evidence.any_supporters]))
     supporters = in_scene[:, [*evidence.row, -1]]
     within = places.within[evidence.classes].astype(np.float64)
-    return Standing(*standing(boxes, floor, shares, np.ascontiguousarray(supporters), within))
+    of_objects = (
+        shares,
+        np.ascontiguousarray(supporters),
+        within,
+        model.containers[evidence.classes],
+    )
+    return Standing(*standing(boxes, floor, *of_objects))
 
 
 def wrong_log_odds(judgement: Judgement, terms: Float[Floats, "n 6"]) -> Float[Floats, "n"]:

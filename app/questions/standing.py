@@ -13,17 +13,18 @@ likelihood of b, per metre (N: normal with the error s, or rarely 3 s; U: 1 / `R
     floating    U
     sunk in     U, if the box reaches below the floor or into an object
 
-Things at wrong places are on or in the supporters of any things, or on the floor where no object
-has its inside. k is the share of things far below the top of such an object: on a seat, or on the
-boards of a shelf (`Places.within`). The usual places of the class have the shares S of floor, wall
-and support, and q of its supporters. An object above a usual supporter is not on an unlisted
-object. Objects at wrong places have the shares `WRONG`. The evidence of a wrong place is the log
-ratio
+Things at wrong places are on or in the supporters of any things, or on the floor, but not inside a
+container there. The shares S of the floor of the other boxes at its height, at most 1 in sum, weigh
+this wrong place, because a single box cannot show the floor and lie wrong on it. k is the share of
+things far below the top of such an object: on a seat, or on the boards of a shelf
+(`Places.within`). The usual places of the class have the shares S of floor, wall and support, and q
+of its supporters. An object above a usual supporter is not on an unlisted object. Objects at wrong
+places have the shares `WRONG`. The evidence of a wrong place is the log ratio
 
     t = log Σ wrong share · likelihood - log Σ usual share · likelihood
 
 So an object is at a wrong place only if no usual place explains its box within the errors. A box
-that probably reaches into an object does not float.
+that probably reaches into an object does not float, and without a floor nothing does.
 
 The judgement of a wrong support also asks how likely a relation of the two classes is. It counts
 with the probability r that the object is on or in the other one, and not at another usual place.
@@ -57,6 +58,7 @@ HUNG_STD: Final = 0.6  # its standard deviation
 LONG: Final = 1.2  # height in metres from which half of the things on a wall reach the floor
 LONG_STD: Final = 0.1  # standard deviation of their bottoms
 NEAR: Final = 1.0  # distance in metres of objects that may be on the same unlisted object
+_TOLD: Final = 0.5  # minimum sum of shares of the floor by which other boxes show the floor
 _USUAL: Final = 0.2  # share q from which a supporter counts fully as usual
 _UNLISTED: Final = 0.3  # share of the unlisted supporters that a scene has
 _LEAST_WITHIN: Final = 0.1  # minimum of k
@@ -83,7 +85,7 @@ class Standing(NamedTuple):
     """The evidence that each of N objects is at a wrong place."""
 
     log_ratio: Float[Floats, "N"]  # t; 0 without a box
-    reason: Int[Indices, "N"]  # the likeliest wrong place; -1 without a box
+    reason: Int[Indices, "N"]  # the likeliest wrong place; -1 without a box or without a reason
     anchor: Int[Indices, "N"]  # the object at the likeliest wrong place, or -1
     held: Float[Floats, "N"]  # r of the object that holds each object most likely
 
@@ -95,6 +97,7 @@ def standing(
     shares: Float[NDArray, "N 3"],  # usual places of each object's class: floor, wall, support
     supporters: Float[NDArray, "N+1 N+1"],  # see `shares_in_scene`
     within: Float[NDArray, " N"],  # share k of the things of each object far below its top
+    closed: Float[NDArray, " N"],  # whether each object is a container, from 0 to 1
 ) -> tuple[Float[NDArray, " N"], Int[NDArray, " N"], Int[NDArray, " N"], Float[NDArray, " N"]]:
     """Return the fields of `Standing`."""
     points, extents, _, errors = boxes
@@ -115,12 +118,16 @@ def standing(
             unheld *= normal_share(floor + HIGHEST - bottom, s)
         usual = shares[i, 0] * at_floor + shares[i, 1] * hung
         largest, total, sunk, deepest, near, strange = 0.0, 0.0, below, -1, 0.0, 0.0
-        of_anchor, usual_anchor, beside, level, carried, enclosed = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        of_anchor, usual_anchor, beside, level, carried = 0.0, 0.0, 0.0, 0.0, 0.0
+        told, enclosed = 0.0, 0.0
         for j in range(N):
             if i == j or math.isnan(points[j, 2] + extents[j, 0] + extents[j, 1] + extents[j, 2]):
                 continue
             error = max(math.hypot(s, errors[j, 1]), SMALLEST_STD)
             lift = bottom - points[j, 2] - extents[j, 2] / 2
+            if not math.isnan(floor):
+                height = points[j, 2] - extents[j, 2] / 2 - floor
+                told += shares[j, 0] * math.exp(-0.5 * (height / error) ** 2)
             if math.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1]) < NEAR:
                 beside += shares[j, 2]
                 level += shares[j, 2] * _normal(lift + extents[j, 2], error)
@@ -134,7 +141,7 @@ def standing(
             overlap *= min(area / _CARRIES, 1.0)
             inside = normal_share(-lift, error) * normal_share(lift + extents[j, 2], error)
             k = max(within[j], _LEAST_WITHIN)
-            enclosed = max(enclosed, overlap * inside * k)
+            enclosed = max(enclosed, overlap * inside * closed[j])
             uniform_in = inside / max(extents[j, 2], error)
             density = overlap * ((1 - k) * _normal(lift, error) + k * uniform_in)
             usual_at = shares[i, 2] * supporters[i, j] * density
@@ -154,7 +161,7 @@ def standing(
         unheld *= carried + (1.0 - carried) * shared
         usual += shares[i, 2] * supporters[i, N] * (1.0 - over) * unheld
         strange += supporters[N, N] * unheld
-        at_floor *= 1.0 - enclosed
+        at_floor *= min(told, 1.0) * (1.0 - enclosed)
         wrong = np.array([at_floor, strange, (1.0 - below) * uniform, sunk * uniform])
         for place in range(4):
             wrong[place] *= WRONG[place]
@@ -164,6 +171,8 @@ def standing(
         reason[i] = shown.argmax()
         if reason[i] == FLOATS and sunk > 0.5:
             reason[i] = SUNK
+        if reason[i] == FLOATS and told < _TOLD:
+            reason[i] = -1
         if reason[i] == SUNK:
             anchor[i] = deepest
         elif reason[i] != ON_OBJECT:
