@@ -290,14 +290,9 @@ def _standing(model: SceneModel, places: Places, scene: Scene, evidence: _Eviden
     boxes = centres, extents, yaws, errors
     in_scene = shares_in_scene(np.concatenate([evidence.supporters, evidence.any_supporters]))
     supporters = in_scene[:, [*evidence.row, -1]]
-    within = places.within[evidence.classes].astype(np.float64)
-    of_objects = (
-        shares,
-        np.ascontiguousarray(supporters),
-        within,
-        model.containers[evidence.classes],
-    )
-    return Standing(*standing(boxes, floor, *of_objects))
+    within, closed = places.within[evidence.classes], model.containers[evidence.classes]
+    of_objects = np.ascontiguousarray(supporters), within.astype(np.float64), closed
+    return Standing(*standing(boxes, floor, shares, *of_objects))
 
 
 def wrong_log_odds(judgement: Judgement, terms: Float[Floats, "n 6"]) -> Float[Floats, "n"]:
