@@ -42,6 +42,7 @@ from app.scene.stands import CLEARANCE, FLOOR, HANGS, SUPPORTED, floor_level
 Triple = tuple[float, float, float]
 
 _BACK: Final = 0.10  # minimum height in metres of a back above a seat
+_LEAST_SEAT: Final = 0.45  # minimum height of a seat, as a share of the height of the box
 _GAP: Final = 0.02  # gap in metres to the anchor beside it, and to the top of an anchor below
 _TOUCH: Final = 0.02  # maximum overlap in metres of the heights of boxes that only touch
 _OFTEN: Final = 0.2  # minimum share of a stand that a class often has
@@ -120,7 +121,8 @@ def _table(
         boxes[i, _SIZE_X], boxes[i, _SIZE_Y] = sizes[i, :2]
         boxes[i, _COS], boxes[i, _SIN] = math.cos(yaws[i]), math.sin(yaws[i])
         boxes[i, _LOW], boxes[i, _HIGH] = centres[i, 2] - half, centres[i, 2] + half
-        seat, boxes[i, _STAND] = boxes[i, _LOW] + seats[i], stands[i].argmax()
+        seat = boxes[i, _LOW] + max(seats[i], _LEAST_SEAT * sizes[i, 2])
+        boxes[i, _STAND] = stands[i].argmax()
         boxes[i, _SURFACE] = seat if seat <= boxes[i, _HIGH] - _BACK else boxes[i, _HIGH]
     floor = floor_level(boxes[:, _LOW], stands[:, FLOOR], np.full(len(yaws), CONTACT))
     for i in range(len(yaws)):
@@ -442,6 +444,8 @@ def _find_obstacles(
     for k in range(len(boxes)):
         low, high, x, y = boxes[k, _LOW], boxes[k, _HIGH], boxes[k, _SIZE_X], boxes[k, _SIZE_Y]
         other = x * y
+        if bottom < low <= bottom + CONTACT:
+            low = bottom  # a box closely above the surface stands on it
         overlap = min(top, high) - max(bottom, low)
         if not overlap > min(_TOUCH, min(top - bottom, high - low) / 2):
             continue
