@@ -7,7 +7,8 @@ stand: neither in a box, nor in the air, nor on an occupied spot. Axes are those
 The missing object has the typical size of its class and the yaw of its anchor. Its bottom follows
 from the faces of the boxes:
 
-- on-top: on the top face of the anchor, or on its seat (`SceneModel.seats`).
+- on-top: on the top face of the anchor, or on its seat (`SceneModel.seats`), which is higher in a
+  high box, such as that of a bunk bed.
 - inside: at the height of the statistics, but between bottom and top of the anchor.
 - contains: on the floor, or at the bottom of the anchor, if the object then surrounds the anchor.
 - under, if the anchor usually stands on the floor: between its legs, at its bottom. Under other

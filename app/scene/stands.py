@@ -39,21 +39,20 @@ def floor_level(
 
         Σ log( S · N(bottom - f; 0, s) + (1 - S) · U · [bottom ≥ f - s] + `_ERROR` · U )
 
-    with U = .4 per metre. Boxes with S below `USUAL` are no candidates.
-
-    A robot that sees a plant, a fork and a spoon at one height sees a table top, and no floor. A
+    with U = .4 per metre. A candidate has S of at least `USUAL`, and is likelier the floor than
+    another surface. A robot that sees a plant, a fork and a spoon at one height sees a table top. A
     surface at the height f has each box with the share H = (1 - S) / 2, so its log-likelihood is
 
         Σ log( H · N(bottom - f; 0, s) + (H + S · [bottom < f - s] + `_ERROR`) · U )
 
-    The height is NaN if this is larger than that of the floor, or without any candidate.
+    Without any candidate, the height is NaN.
     """
     likeliest, level = -math.inf, math.nan
     for f in range(len(bottoms)):
         if math.isfinite(bottoms[f]) and shares[f] >= USUAL:
             floor, surface = _log_likelihoods(bottoms[f], bottoms, shares, errors)
-            if floor > likeliest:
-                likeliest, level = floor, bottoms[f] if floor >= surface else math.nan
+            if floor >= surface and floor > likeliest:
+                likeliest, level = floor, bottoms[f]
     return level
 
 

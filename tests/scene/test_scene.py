@@ -266,6 +266,9 @@ def test_a_table_top_is_not_the_floor() -> None:
     assert math.isnan(floor_level(bottoms, np.array([0.6, 0.01, 0.01]), errors))
     # Two chairs at this height are on the floor, and the spoon has fallen.
     assert floor_level(bottoms, np.array([0.98, 0.98, 0.01]), errors) == 0.8
+    # Two lamps and a pot on a bed show its top, and the bed shows the floor.
+    on_bed, stands = np.array([0.0, 1.0, 1.0, 1.0]), np.array([0.9, 0.2, 0.2, 0.5])
+    assert floor_level(on_bed, stands, np.full(4, 0.05)) == 0.0
     # A plant beside a spoon, by hand.
     shares, peak = np.array([0.6, 0.01]), 1 / (0.05 * math.sqrt(2 * math.pi))
     floor = math.log(0.6 * peak + 0.4 * (0.4 + 0.05)) + math.log(0.01 * peak + 0.4 * (0.99 + 0.05))
