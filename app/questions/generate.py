@@ -42,7 +42,7 @@ from scene_client.schemas import GenerateAnswer, GenerateRequest
 STEPS: Final = 50
 """Default number of Gibbs sweeps for one drawn scene."""
 
-IMPOSSIBLE: Final = -4.0
+IMPOSSIBLE: Final = -3.0
 """Log prior at which a drawn support is left out."""
 
 ATTEMPTS: Final = 8
