@@ -27,7 +27,7 @@ from app.questions.misplaced import (
     wrong_relations,
 )
 from app.questions.posterior import present
-from app.questions.standing import ON_FLOOR, WRONG, Standing, shares_in_scene, standing
+from app.questions.standing import Standing, shares_in_scene, standing
 from app.scene import ObjectClass, RelationTable, Scene, SceneObject, Vocabulary, observe
 from app.scene.scene import errors_of
 from app.scene.spatial_relations import ABOVE, INSIDE, LEFT, ON_TOP
@@ -259,7 +259,7 @@ def test_a_confirmed_support_has_no_other_evidence(is_posed):
 # ------------------------------------------------------------------------------------------ boxes
 
 
-def evidence(scene, floor=0.0, places=PLACES, containers=None):
+def evidence(scene, floor=0.0, places=PLACES):
     """The evidence about each object of a scene with boxes, with the terms t and r."""
     classes = np.array([thing.class_index for thing in scene.objects])
     centres = np.array([thing.position for thing in scene.objects])
@@ -270,9 +270,8 @@ def evidence(scene, floor=0.0, places=PLACES, containers=None):
     errors = errors_of(scene.objects, sizes, classes, None)
     boxes = centres, sizes, np.zeros(len(classes)), errors
     stands, within = np.array(STANDS)[classes], places.within[classes].astype(float)
-    containers = np.zeros(V) if containers is None else containers
-    in_scene = shares_in_scene(supporters)
-    return Standing(*standing(boxes, floor, stands, in_scene, within, containers[classes]))
+    of_objects = stands, shares_in_scene(supporters), within, np.zeros(len(classes))
+    return Standing(*standing(boxes, floor, *of_objects))
 
 
 BESIDE_IT = (9.0, 0.0, 0.0)
@@ -311,58 +310,6 @@ def test_each_box_has_one_entry_with_its_likeliest_wrong_place(thing, other, tri
     entry = answer[NAMES[thing[0]]]
     assert entry["reason"] == reason
     assert entry["object"] == (NAMES[other[0]] if triple[2] >= 0 else THE_FLOOR)
-
-
-def test_things_beside_one_another_share_an_unlisted_supporter():
-    """A pot at .9 m, and a monitor beside it at the same height: by hand."""
-    things = posed((POT, (0, 0, 0.9)), (MONITOR, (0.5, 0, 0.9))).objects
-    classes = np.array([POT, MONITOR])
-    (s, other), share = (
-        errors_of(things, np.array([SIZES[c] for c in classes]), classes, None)[:, 1],
-        STANDS[MONITOR][2],
-    )
-
-    def density(distance, error):
-        narrow, wide = (math.exp(-0.5 * (distance / x) ** 2) / x for x in (error, 3 * error))
-        return (0.99 * narrow + 0.01 * wide) / math.sqrt(2 * math.pi)
-
-    uniform = 1 / 2.5
-    level = density(0, math.hypot(s, other))
-    unlisted = (uniform + share * level) / (1 + share)
-    hung = uniform / 2 + density(1.1 - 2.0, 0.6) / 2
-    rows = [PLACES.supporters(classes, classes)[0], PLACES.any_supporters(classes)]
-    usual_share, any_share = shares_in_scene(np.array(rows))[:, -1]
-    _, wall, support = STANDS[POT]
-    usual = wall * hung + support * usual_share * unlisted
-    wrong = WRONG[1] * any_share * unlisted + WRONG[2] * uniform
-    assert evidence(Scene(things)).log_ratio[0] == pytest.approx(math.log(wrong / usual), rel=1e-4)
-    # At another height, the monitor does not show the unlisted supporter.
-    lower = replace(things[1], position=(0.5, 0, 0.6))
-    assert evidence(Scene((things[0], lower))).log_ratio[0] > math.log(wrong / usual)
-
-
-def test_a_single_box_cannot_show_the_floor_and_lie_wrong_on_it():
-    monitor, rug = (MONITOR, (0, 0, 0)), (RUG, (4, 0, 0))
-    assert evidence(posed(monitor)).reason.tolist() == [-1]
-    assert evidence(posed(monitor, rug)).reason[0] == ON_FLOOR
-    # Neither shows where the floor is, so neither floats.
-    assert evidence(posed((POT, (0, 0, 1)), (MONITOR, (4, 0, 1))), math.nan).reason.max() == -1
-
-
-def test_a_relation_counts_as_far_as_the_object_is_at_the_other_one():
-    """A pot on the sofa is on it. A pot that reaches over its edge may be on something beside."""
-    on, beside = (
-        evidence(posed((POT, (0, y, 0.8)), (SOFA, (0, 0, 0)), (MONITOR, (0, y + 0.5, 0.8)))).held[0]
-        for y in (0.0, 0.54)
-    )
-    assert 0 < beside < 0.5 < on < 1
-
-
-def test_the_inside_of_a_container_is_not_the_floor():
-    scene = posed((MONITOR, (0, 0, 0.02)), (SHELF, (0, 0, 0)), (STOVE, (9, 0, 0)))
-    inside, on_floor = evidence(scene, containers=np.arange(V) == SHELF), evidence(scene)
-    assert on_floor.reason[0] == ON_FLOOR
-    assert inside.log_ratio[0] < on_floor.log_ratio[0] - 0.5
 
 
 def test_a_thing_in_a_listed_container_is_inside_it():
