@@ -84,10 +84,11 @@ class SceneModel:
 
     @cached_property
     def descriptions(self) -> Float[NDArray[np.float64], "V columns"]:
-        """Rows of the prior of possibility for all classes, with their typical sizes."""
+        """Rows of the prior of possibility for all trained classes, with their typical sizes."""
         if self.possibility is None:
             return np.zeros((self.spec.V, 0))
-        return self.possibility.rows(np.arange(self.spec.V), self.vocabulary.sizes)
+        V = len(self.possibility.spread)  # a model with words has further classes
+        return self.possibility.rows(np.arange(V), self.vocabulary.sizes[:V])
 
     @cached_property
     def relation_slopes(self) -> RelationSlopes:

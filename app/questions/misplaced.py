@@ -94,6 +94,8 @@ THE_FLOOR: Final = "floor"
 LEAST_Z: Final = -8.0  # below it, log-odds do not tell wrong relations from rare ones
 _LEAST_P: Final = 3e-4  # minimum of a share
 LEAST_LISTED: Final = 0.05  # least probability of a listed box that is not on an object
+_PARTIAL: Final = 0.8  # share of the usual height below which the lower part may be hidden
+_LIKE: Final = 0.3  # maximum difference of the height of a top, as a share of the usual height
 EXPLAINED: Final = 5.0
 """z of a confirmed relation; minimum z of an object above another object on a third object."""
 
@@ -265,25 +267,26 @@ def _posed(model: SceneModel, posterior: Posterior, scene: Scene) -> Iterator[_E
 
 
 def _standing(model: SceneModel, places: Places, scene: Scene, evidence: _Evidence) -> Standing:
-    """Return what the boxes of a scene say. Furniture whose box is only its top reaches down.
+    """Return what the boxes of a scene say. Furniture whose lower part is hidden reaches the floor.
 
-    Such furniture tells where the floor is, if no whole box does.
+    Such a box is lower than usual, and its top is at the usual height. If no whole box shows the
+    floor, boxes of at most half of the usual height show it by their tops.
     """
     vocabulary, shares = model.vocabulary, evidence.stands
     centres, extents = boxes_of(scene.objects, vocabulary.sizes)
     errors = errors_of(scene.objects, extents, evidence.classes, model.spread)
     usual_height = vocabulary.sizes[evidence.classes, 2]
-    is_top = (shares[:, FLOOR] >= USUAL) & (extents[:, 2] < usual_height / 2)
-    bottoms = centres[:, 2] - extents[:, 2] / 2
-    reached = bottoms + extents[:, 2] - usual_height
-    std = errors[:, 1].copy()
-    on_floor = np.ascontiguousarray(shares[:, FLOOR])
-    whole = np.where(is_top, np.nan, bottoms)
-    floor = floor_level(whole, on_floor, std)
+    bottoms, tops = (centres[:, 2] + side * extents[:, 2] / 2 for side in (-1, 1))
+    on_floor, std = np.ascontiguousarray(shares[:, FLOOR]), errors[:, 1].copy()
+    is_furniture = evidence.is_thing & (on_floor >= USUAL)
+    is_top = is_furniture & (extents[:, 2] < usual_height / 2)
+    bottoms[~evidence.is_thing] = np.nan
+    floor = floor_level(np.where(is_top, np.nan, bottoms), on_floor, std)
     if np.isnan(floor):
-        floor = floor_level(np.where(is_top, reached, bottoms), on_floor, std)
-    reached = np.fmax(reached, floor)
-    longer = np.where(is_top, np.fmax(bottoms - reached, 0.0), 0.0)
+        floor = floor_level(np.where(is_top, tops - usual_height, bottoms), on_floor, std)
+    is_hidden = is_furniture & (extents[:, 2] < _PARTIAL * usual_height)
+    is_hidden &= np.abs(tops - floor - usual_height) <= _LIKE * usual_height
+    longer = np.where(is_hidden, np.fmax(bottoms - floor, 0.0), 0.0)
     centres[:, 2] -= longer / 2
     extents[:, 2] += longer
     yaws = np.array([thing.yaw for thing in scene.objects])

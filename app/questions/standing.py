@@ -52,12 +52,13 @@ WRONG: Final = (0.25, 0.4, 0.25, 0.1)
 
 ROOM: Final = 2.5  # height of a room in metres
 LOWEST: Final = 0.2  # lowest top in metres of an unlisted object on which others are
-HIGHEST: Final = 2.0  # highest top in metres of such an object
+HIGHEST: Final = 2.0  # height in metres above which the tops of such objects are rarer
+_HIGHER: Final = 0.25  # their share of the density there
 HUNG: Final = 2.0  # usual height in metres of the top of an object on a wall
 HUNG_STD: Final = 0.6  # its standard deviation
 LONG: Final = 1.2  # height in metres from which half of the things on a wall reach the floor
 LONG_STD: Final = 0.1  # standard deviation of their bottoms
-NEAR: Final = 1.0  # distance in metres of objects that may be on the same unlisted object
+NEAR: Final = 0.5  # standard deviation in metres of the distances of objects on one unlisted object
 _TOLD: Final = 0.5  # minimum sum of shares of the floor by which other boxes show the floor
 _USUAL: Final = 0.2  # share q from which a supporter counts fully as usual
 _UNLISTED: Final = 0.3  # share of the unlisted supporters that a scene has
@@ -111,35 +112,39 @@ def standing(
         at_floor, below, unheld, hung, over = 0.0, 0.0, uniform, uniform, 0.0
         if not math.isnan(floor):
             at_floor, below = _normal(bottom - floor, s), normal_share(floor - 2 * s - bottom, s)
-            unheld *= normal_share(bottom - floor - LOWEST, s)
-            hung = unheld / 2 + _normal(bottom + extents[i, 2] - floor - HUNG, HUNG_STD) / 2
+            hung = uniform * normal_share(bottom - floor, s) / 2
+            hung += _normal(bottom + extents[i, 2] - floor - HUNG, HUNG_STD) / 2
             if extents[i, 2] >= LONG:
                 hung = (hung + _normal(bottom - floor, max(s, LONG_STD))) / 2
-            unheld *= normal_share(floor + HIGHEST - bottom, s)
+            unheld *= normal_share(bottom - floor - LOWEST, s)
+            unheld *= _HIGHER + (1.0 - _HIGHER) * normal_share(floor + HIGHEST - bottom, s)
         usual = shares[i, 0] * at_floor + shares[i, 1] * hung
         largest, total, sunk, deepest, near, strange = 0.0, 0.0, below, -1, 0.0, 0.0
         of_anchor, usual_anchor, beside, level, carried = 0.0, 0.0, 0.0, 0.0, 0.0
         told, enclosed = 0.0, 0.0
         for j in range(N):
-            if i == j or math.isnan(points[j, 2] + extents[j, 0] + extents[j, 1] + extents[j, 2]):
+            sizes = extents[j, 0] + extents[j, 1] + extents[j, 2]
+            if i == j or supporters[N, j] == 0.0 or math.isnan(points[j, 2] + sizes):
                 continue
             error = max(math.hypot(s, errors[j, 1]), SMALLEST_STD)
             lift = bottom - points[j, 2] - extents[j, 2] / 2
             if not math.isnan(floor):
                 height = points[j, 2] - extents[j, 2] / 2 - floor
                 told += shares[j, 0] * math.exp(-0.5 * (height / error) ** 2)
-            if math.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1]) < NEAR:
-                beside += shares[j, 2]
-                level += shares[j, 2] * _normal(lift + extents[j, 2], error)
+            distance = math.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1])
+            weight = shares[j, 2] * math.exp(-0.5 * (distance / NEAR) ** 2)
+            beside += weight
+            level += weight * _normal(lift + extents[j, 2], error)
             overlap = _overlap(boxes, i, j)
             if overlap < _LEAST_OVERLAP:
                 continue
             # Only a thick object tells things on it from things beside it.
             thick = 1.0 - math.exp(-0.5 * (extents[j, 2] / error) ** 2)
-            carried = max(carried, overlap * thick * math.exp(-0.5 * (lift / error) ** 2))
+            inside = normal_share(-lift, error) * normal_share(lift + extents[j, 2], error)
+            held_by_it = max(thick * math.exp(-0.5 * (lift / error) ** 2), within[j] * inside)
+            carried = max(carried, overlap * held_by_it)
             area = extents[j, 0] * extents[j, 1] / max(extents[i, 0] * extents[i, 1], 1e-9)
             overlap *= min(area / _CARRIES, 1.0)
-            inside = normal_share(-lift, error) * normal_share(lift + extents[j, 2], error)
             k = max(within[j], _LEAST_WITHIN)
             enclosed = max(enclosed, overlap * inside * closed[j])
             uniform_in = inside / max(extents[j, 2], error)
@@ -154,7 +159,7 @@ def standing(
             likely = density * (supporters[i, j] + _UNUSUAL)
             if likely > largest:
                 largest, anchor[i], of_anchor, usual_anchor = likely, j, density, usual_at
-            deep = overlap * normal_share(-lift - 2 * error, error) * inside
+            deep = overlap * normal_share(-lift - 2 * error, error) * inside * (1.0 - within[j])
             if deep > sunk and supporters[i, j] > 0.0:
                 sunk, deepest = deep, j
         shared = (1.0 + level / uniform) / (1.0 + beside)
@@ -177,7 +182,7 @@ def standing(
             anchor[i] = deepest
         elif reason[i] != ON_OBJECT:
             anchor[i] = -1
-        of_anchor *= WRONG[ON_OBJECT] / max(near, 1.0)
+        of_anchor *= (1.0 - shares[i, 1]) * WRONG[ON_OBJECT] / max(near, 1.0)
         held[i] = of_anchor / max(of_anchor + usual - usual_anchor, _LEAST)
         log_ratio[i] = math.log(max(wrong.sum(), _LEAST) / max(usual, _LEAST))
     return log_ratio, reason, anchor, held
@@ -202,5 +207,6 @@ def _overlap(boxes, i, j):
     distance = math.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1])
     if distance > radius / 2:
         return 0.0
-    share, _ = measure(points[i], extents[i], turns[i], points[j], extents[j], turns[j])
-    return overlap_probability(boxes, i, j, share) if share > 0.0 else 0.0
+    share, gap = measure(points[i], extents[i], turns[i], points[j], extents[j], turns[j])
+    smaller = min(extents[i, 0] * extents[i, 1], extents[j, 0] * extents[j, 1])
+    return overlap_probability(boxes, i, j, share - gap / math.sqrt(max(smaller, 1e-9)))
