@@ -253,7 +253,7 @@ def test_a_confirmed_support_has_no_other_evidence(is_posed):
         scene = posed((POT, (0, 0, 0.8)), (SOFA, (0, 0, 0)))
     table = entries(scene, artifact=artifact)
     assert table[ON_TOP, 0, 1][1] == [EXPLAINED, 0.0, 0.0, 0.0, 0.0]
-    assert entries(scene, artifact=WITH_PRIOR)[ON_TOP, 0, 1][1][4] < -7
+    assert entries(scene, artifact=WITH_PRIOR)[ON_TOP, 0, 1][1][4] < -6
 
 
 # ------------------------------------------------------------------------------------------ boxes
@@ -327,21 +327,40 @@ def test_a_thing_in_a_listed_container_is_inside_it():
     assert table[INSIDE, 1, 0][1][0] == pytest.approx(0.5 * r)
 
 
-def test_furniture_whose_box_is_only_its_top_reaches_down():
-    """A sensor saw only the top of the desk, 5 cm thick. The same box as a shelf's board floats."""
-    others = [(RUG, (20, 0, 0)), (BIN, (24, 0, 0)), (STOVE, (28, 0, 0))]
-    scene = posed((DESK, (0, 0, 0)), *others)
-    top = replace(scene.objects[0], position=(0, 0, 0.725), size=(1.6, 0.8, 0.05))
-    cut = observe(Scene((top, *scene.objects[1:])))
-    assert entries(cut)[ON_TOP, 0, -1][0] == POSED
-    pot = replace(top, id="pot", label="pot", class_index=POT)
-    table = entries(observe(Scene((pot, *scene.objects[1:]))))
-    assert table[ABOVE, 0, -1][0] == UNHELD
+def seen_part(scene, bottom, top):
+    """The scene, in which a sensor saw only this part of the height of the first box."""
+    thing = scene.objects[0]
+    x, y, _ = thing.position
+    part = replace(thing, position=(x, y, (bottom + top) / 2), size=(*thing.size[:2], top - bottom))
+    return observe(Scene((part, *scene.objects[1:])))
+
+
+OTHERS = [(RUG, (20, 0, 0)), (BIN, (24, 0, 0)), (STOVE, (28, 0, 0))]
+
+
+@pytest.mark.parametrize("bottom", [0.2, 0.4, 0.7])
+def test_furniture_whose_lower_part_is_hidden_reaches_the_floor(bottom):
+    """The top of the desk is .75 m high. The same box as a pot floats, and so does a higher one."""
+    desk = posed((DESK, (0, 0, 0)), *OTHERS)
+    whole, part = entries(desk), entries(seen_part(desk, bottom, 0.75))
+    found, expected = (table[ON_TOP, 0, -1] for table in (part, whole))
+    assert found[0] == expected[0] == POSED
+    assert found[1] == pytest.approx(expected[1], abs=0.02)  # the error of the height differs
+    assert entries(seen_part(desk, bottom + 0.6, 1.35))[ABOVE, 0, -1][0] == UNHELD
+    pot = posed((POT, (0, 0, 0)), *OTHERS)
+    assert entries(seen_part(pot, 0.7, 0.75))[ABOVE, 0, -1][0] == UNHELD
+
+
+def test_a_small_thing_of_a_large_kind_is_not_stretched():
+    """A bin of 10 cm on the desk is on it, although bins are .4 m high."""
+    scene = posed((BIN, (0, 0, 0.75)), (DESK, (0, 0, 0)), *OTHERS)
+    assert entries(seen_part(scene, 0.75, 0.85))[ON_TOP, 0, 1][0] == HELD
 
 
 def test_structure_is_neither_judged_nor_an_anchor():
-    on_it = posed((WALL, (0, 0, 0)), (POT, (0, 0, 2.5)), (STOVE, (9, 0, 0)))
-    assert not any(0 in (i, j) for _, i, j in entries(on_it))
+    on_it = posed((POT, (0, 0, 2.5)), (STOVE, (9, 0, 0)), (WALL, (0, 0, 0)))
+    without = posed((POT, (0, 0, 2.5)), (STOVE, (9, 0, 0)))
+    assert entries(on_it) == entries(without)
     # A pot that reaches into the wall floats, because something else should hold it.
     in_it = posed((WALL, (0, 0, 0)), (POT, (0, 0, 1.2)), (STOVE, (9, 0, 0)))
     assert entries(in_it)[ABOVE, 1, -1][0] == UNHELD

@@ -81,7 +81,7 @@ def test_a_box_on_nothing_is_that_of_a_hand_computation(bottom):
     s = math.hypot(ERROR, 0.9 * ERROR)
     on_floor, below = normal(bottom, s), share(-2 * s - bottom, s)
     lifted = share(bottom - 0.2, s) / ROOM
-    hung = lifted / 2 + normal(bottom + 0.9 - HUNG, HUNG_STD) / 2
+    hung = share(bottom, s) / ROOM / 2 + normal(bottom + 0.9 - HUNG, HUNG_STD) / 2
     # 1 % of the supporters are of each class, and unlisted ones count with .3 of their share.
     unlisted = 0.3 * 0.98 / (0.3 * 0.98 + 0.02) * lifted * share(2.0 - bottom, s)
     usual = 0.4 * on_floor + 0.3 * hung + 0.3 * unlisted
@@ -101,21 +101,21 @@ def test_a_box_on_another_is_that_of_a_hand_computation(lift):
     inside = share(-lift, error) * share(bottom, error)
     density = 0.9 * normal(lift, error) + 0.1 * inside / 0.75
     on_floor, lifted = normal(bottom, s), share(bottom - 0.2, s) / ROOM
-    hung = lifted / 2 + normal(bottom + 0.1 - HUNG, HUNG_STD) / 2
+    hung = share(bottom, s) / ROOM / 2 + normal(bottom + 0.1 - HUNG, HUNG_STD) / 2
     blocked = 1 - share(lift - 0.2, error)
     # Where the table does not carry the cup, an unlisted object may have the height of the table.
-    carried, beside = math.exp(-0.5 * (lift / error) ** 2), 0.03
+    carried, beside = max(math.exp(-0.5 * (lift / error) ** 2), 0.1 * inside), 0.03
     level = (1 + beside * ROOM * normal(bottom, error)) / (1 + beside)
     unheld = lifted * share(2.0 - bottom, s) * (carried + (1 - carried) * level)
     # Half of the supporters of cups are tables, 1 % are cups, and unlisted ones count with .3.
     table, rest = np.array([0.5, 0.3 * 0.49]) / (0.51 + 0.3 * 0.49)
     held = table * density + rest * blocked * unheld
     usual = 0.005 * on_floor + 0.015 * hung + 0.98 * held
-    r = WRONG[ON_OBJECT] * density
+    r = (1 - 0.015) * WRONG[ON_OBJECT] * density  # things on the wall are on nothing
     r /= r + usual - 0.98 * table * density
     # The same with the supporters of all things: .3 are tables.
     table, rest = np.array([0.3, 0.3 * 0.69]) / (0.31 + 0.3 * 0.69)
-    sunk = share(-2 * error - lift, error) * inside
+    sunk = 0.9 * share(-2 * error - lift, error) * inside
     strange = table * density + rest * unheld
     wrong = np.array(WRONG) * [0.96 * on_floor, strange, 1 / ROOM, sunk / ROOM]
     assert at.log_ratio[1] == pytest.approx(math.log(wrong.sum() / usual), abs=1e-5)
@@ -127,11 +127,11 @@ def test_things_at_one_height_share_a_supporter_that_the_scene_does_not_list():
     """A pillow and a cup at .9 m are on one worktop, if the cup is near and no bed is below it."""
     near, far, over_a_bed = (
         judge(("pillow", 0, 0, 0.9), ("cup", x, 0, 0.9), ("bed", y, 0, 0)).log_ratio[0]
-        for x, y in ((0.9, 5), (1.1, 5), (0.9, 0))
+        for x, y in ((0.5, 5), (2.0, 5), (0.5, 0))
     )
     assert near < far - 0.3
     assert over_a_bed == pytest.approx(
-        judge(("pillow", 0, 0, 0.9), ("cup", 1.1, 0, 0.9), ("bed", 0, 0, 0)).log_ratio[0], abs=0.01
+        judge(("pillow", 0, 0, 0.9), ("cup", 2.0, 0, 0.9), ("bed", 0, 0, 0)).log_ratio[0], abs=0.01
     )
 
 
