@@ -152,8 +152,9 @@ def _scene(
 
 def _told(model: SceneModel, a: int, i: int, j: int) -> Fields:
     """Return the `GeneratedRelation` in the usual words: a bin under a desk."""
-    labels, places = model.vocabulary.labels, model.places
-    if a == ON_TOP and places is not None and places.means_under(i, j):
+    labels, places, stand_in = model.vocabulary.labels, model.places, model.vocabulary.stand_in
+    pair = int(stand_in[i]), int(stand_in[j])
+    if a == ON_TOP and places is not None and places.means_under(*pair):
         return {"subject": labels[j], "relation": opposite(CANONICAL[a]), "object": labels[i]}
     return {"subject": labels[i], "relation": CANONICAL[a], "object": labels[j]}
 
@@ -169,8 +170,11 @@ def _possible(
     admitted = np.ones(len(triples), np.bool_)
     if prior is None or places is None:
         return admitted
-    for row, (a, i, j) in enumerate(triples.tolist()):
-        if a not in SUPPORTS or (a, i, j) in evidence or (a == ON_TOP and places.means_under(i, j)):
+    stand_in = model.vocabulary.stand_in.tolist()  # words that have no class
+    for row, (a, subject, anchor) in enumerate(triples.tolist()):
+        i, j = stand_in[subject], stand_in[anchor]
+        is_evidence = (a, subject, anchor) in evidence
+        if a not in SUPPORTS or is_evidence or (a == ON_TOP and places.means_under(i, j)):
             continue
         share = places.literal_share(i, j) if a == ON_TOP else 1.0
         things, others = np.array([i]), np.array([j])
