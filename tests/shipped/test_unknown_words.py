@@ -10,7 +10,7 @@ WORD = {"id": "h", "label": "hovercraft", "position": [1, 0, 0.8], "size": [0.1,
 SCENES = {
     "boxes": {"objects": [TABLE, WORD]},
     "relations": {
-        "objects": ["table", "hovercraft"],
+        "objects": ["table", "hovercraft", "chopstick rest", "plate"],
         "relations": [["hovercraft", "on-top", "table"]],
     },
 }
