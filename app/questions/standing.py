@@ -6,12 +6,13 @@ likelihood of b, per metre (N: normal with the error s, or rarely 3 s; U: 1 / `R
     floor       N(b; 0, s)
     on or in j  overlap · [(1 - k) · N(b - top of j; 0, s) + k · U(b between bottom and top of j)]
     on or in an object that the scene does not list   if b is between `LOWEST` and `HIGHEST`:
-                (U + Σ S_j N(b - bottom of j; 0, s)) / (1 + Σ S_j), summed over the objects j within
-                `NEAR`, because things on one counter have one height; U if a listed object is there
+                (U + Σ w_j N(b - bottom of j; 0, s)) / (1 + Σ w_j), because things on one counter
+                have one height: w_j is the share S of supports of object j, less far away (`NEAR`);
+                U if a listed object holds this one; `_HIGHER` of it above `HIGHEST`
     on a wall or at the ceiling   half of U, and half of N(top; `HUNG`, `HUNG_STD`). Things as
                                   high as `LONG`, such as curtains, often reach the floor
     floating    U
-    sunk in     U, if the box reaches below the floor or into an object
+    sunk in     U, if the box reaches below the floor or into an object, unless into a shelf
 
 Things at wrong places are on or in the supporters of any things, or on the floor, but not inside a
 container there. The shares S of the floor of the other boxes at its height, at most 1 in sum, weigh
@@ -28,6 +29,7 @@ that probably reaches into an object does not float, and without a floor nothing
 
 The judgement of a wrong support also asks how likely a relation of the two classes is. It counts
 with the probability r that the object is on or in the other one, and not at another usual place.
+Structure, such as a listed floor or wall, holds nothing, and things on the wall are on nothing.
 """
 
 import math
