@@ -92,12 +92,12 @@ def test_a_home_keeps_the_terms_of_its_parent(store, tmp_path):
 
 @pytest.mark.parametrize(
     ("top", "support", "is_stated_reported"),
-    [("chair", "washing machine", True), ("bucket", "desk", False)],
+    [("chair", "washing machine", True), ("crate", "desk", False)],
 )
 def test_a_relation_of_boxes_that_stands_right_is_not_reported_again(
     store, tmp_path, top, support, is_stated_reported
 ):
-    """Boxes show that the floor holds most buckets, so more relations look wrong than as stated."""
+    """Boxes show that the floor holds most crates, so more relations look wrong than as stated."""
     words = default(store).vocabulary
     others = {"dining table": (2.0, 2.2), "fridge": (2.2, -1.8)}
 

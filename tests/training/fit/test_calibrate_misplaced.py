@@ -243,19 +243,23 @@ def seen(model, request):
 
 
 @pytest.mark.parametrize("moved", range(4))
-def test_a_part_of_boxes_keeps_the_moved_object(moved):
+def test_a_part_of_boxes_has_the_objects_near_the_moved_one(moved):
     whole = replace(scene_of(scene([0, 1, 2, 3]), range(4), ()), relations=None)
-    kept = Counter()
-    for seed in range(60):
-        part, index = module._part_with(whole, moved, np.random.default_rng(seed))
+    x = (0.0, 1.0, 3.0, 7.0)
+    placed = (
+        replace(thing, position=(at, 0, 0)) for thing, at in zip(whole.objects, x, strict=True)
+    )
+    whole, sizes = replace(whole, objects=tuple(placed)), Counter()
+    nearest = sorted(range(4), key=lambda k: abs(x[k] - x[moved]))
+    for seed in range(200):
+        part, index = module._part_near(whole, moved, np.random.default_rng(seed))
         assert part.objects[index] == whole.objects[moved]
-        rest = iter(whole.objects)
-        assert all(thing in rest for thing in part.objects), "the order stays"
-        kept.update(thing.id for thing in part.objects)
-    assert kept.pop(str(moved)) == 60
-    # Each other object is in about half of the parts.
-    assert len(kept) == 3
-    assert all(0.25 < count / 60 < 0.75 for count in kept.values())
+        kept = [int(thing.id) for thing in part.objects]
+        assert kept == sorted(nearest[: len(kept)]), "the order stays"
+        sizes[len(kept)] += 1
+    # The logarithm of the number is uniform: log 1.5 / log 4 = .29 of the parts have one object.
+    assert abs(sizes[1] / 200 - np.log(1.5) / np.log(4)) < 3 * np.sqrt(0.29 * 0.71 / 200)
+    assert 0 < sizes[4] < sizes[3]
 
 
 def test_scenes_with_boxes_are_asked_in_parts_too(furnished):
