@@ -246,7 +246,7 @@ def _posed(model: SceneModel, posterior: Posterior, scene: Scene) -> Iterator[_E
     at = _standing(model, model.places, scene, evidence)
     for i, (reason, j) in enumerate(zip(at.reason.tolist(), at.anchor.tolist(), strict=True)):
         on_object = reason == ON_OBJECT
-        if reason < 0 or not evidence.is_thing[i] or (j >= 0 and not evidence.is_thing[j]):
+        if reason < 0 or not evidence.is_thing[i]:
             continue
         if not on_object:
             if evidence.moves[i]:

@@ -445,9 +445,8 @@ def _find_obstacles(
     for k in range(len(boxes)):
         low, high, x, y = boxes[k, _LOW], boxes[k, _HIGH], boxes[k, _SIZE_X], boxes[k, _SIZE_Y]
         other = x * y
-        if bottom < low <= bottom + CONTACT:
-            low = bottom  # a box closely above the surface stands on it
-        overlap = min(top, high) - max(bottom, low)
+        # A box closely above the surface stands on it.
+        overlap = min(top, high) - (bottom if low <= bottom + CONTACT else low)
         if not overlap > min(_TOUCH, min(top - bottom, high - low) / 2):
             continue
         # Objects stand on a rug or a tablecloth, and a container can hold several objects.

@@ -5,12 +5,12 @@ likelihood of b, per metre (N: normal with the error s, or rarely 3 s; U: 1 / `R
 
     floor       N(b; 0, s)
     on or in j  overlap · [(1 - k) · N(b - top of j; 0, s) + k · U(b between bottom and top of j)]
-    on or in an object that the scene does not list   if b is between `LOWEST` and `HIGHEST`:
+    on or in an object that the scene does not list   if b is between `_LOWEST` and `_HIGHEST`:
                 (U + Σ w_j N(b - bottom of j; 0, s)) / (1 + Σ w_j), because things on one counter
-                have one height: w_j is the share S of supports of object j, less far away (`NEAR`);
-                U if a listed object holds this one; `_HIGHER` of it above `HIGHEST`
+                have one height: w_j is the share S of supports of object j, less if it is far away
+                (`_NEAR`); U if a listed object holds this one; `_HIGHER` of it above `_HIGHEST`
     on a wall or at the ceiling   half of U, and half of N(top; `HUNG`, `HUNG_STD`). Things as
-                                  high as `LONG`, such as curtains, often reach the floor
+                                  high as `_LONG`, such as curtains, often reach the floor
     floating    U
     sunk in     U, if the box reaches below the floor or into an object, unless into a shelf
 
@@ -25,7 +25,8 @@ places have the shares `WRONG`. The evidence of a wrong place is the log ratio
     t = log Σ wrong share · likelihood - log Σ usual share · likelihood
 
 So an object is at a wrong place only if no usual place explains its box within the errors. A box
-that probably reaches into an object does not float, and without a floor nothing does.
+that probably reaches into an object does not float. Nothing floats if the shares of the floor of
+the other boxes at its height sum to less than `_TOLD`.
 
 The judgement of a wrong support also asks how likely a relation of the two classes is. It counts
 with the probability r that the object is on or in the other one, and not at another usual place.
@@ -39,7 +40,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from app.compiling import compiled
+from app.compiling import compiled, inlined
 from app.scene.footprints import measure
 from app.scene.scene import SMALLEST_STD, Boxes, normal_share, overlap_probability
 
@@ -53,14 +54,16 @@ WRONG: Final = (0.25, 0.4, 0.25, 0.1)
 """Shares of objects at wrong places: on the floor, on or in an object, floating, and sunk in."""
 
 ROOM: Final = 2.5  # height of a room in metres
-LOWEST: Final = 0.2  # lowest top in metres of an unlisted object on which others are
-HIGHEST: Final = 2.0  # height in metres above which the tops of such objects are rarer
+_LOWEST: Final = 0.2  # lowest top in metres of an unlisted object on which others are
+_HIGHEST: Final = 2.0  # height in metres above which the tops of such objects are rarer
 _HIGHER: Final = 0.25  # their share of the density there
 HUNG: Final = 2.0  # usual height in metres of the top of an object on a wall
 HUNG_STD: Final = 0.6  # its standard deviation
-LONG: Final = 1.2  # height in metres from which half of the things on a wall reach the floor
-LONG_STD: Final = 0.1  # standard deviation of their bottoms
-NEAR: Final = 0.5  # standard deviation in metres of the distances of objects on one unlisted object
+_LONG: Final = 1.2  # height in metres from which half of the things on a wall reach the floor
+_LONG_STD: Final = 0.1  # standard deviation of their bottoms
+_NEAR: Final = (
+    0.5  # standard deviation in metres of the distances of objects on one unlisted object
+)
 _TOLD: Final = 0.5  # minimum sum of shares of the floor by which other boxes show the floor
 _USUAL: Final = 0.2  # share q from which a supporter counts fully as usual
 _UNLISTED: Final = 0.3  # share of the unlisted supporters that a scene has
@@ -111,19 +114,11 @@ def standing(
         if math.isnan(bottom + extents[i, 0] + extents[i, 1]):
             continue
         s = max(errors[i, 1], SMALLEST_STD)
-        at_floor, below, unheld, hung, over = 0.0, 0.0, uniform, uniform, 0.0
-        if not math.isnan(floor):
-            at_floor, below = _normal(bottom - floor, s), normal_share(floor - 2 * s - bottom, s)
-            hung = uniform * normal_share(bottom - floor, s) / 2
-            hung += _normal(bottom + extents[i, 2] - floor - HUNG, HUNG_STD) / 2
-            if extents[i, 2] >= LONG:
-                hung = (hung + _normal(bottom - floor, max(s, LONG_STD))) / 2
-            unheld *= normal_share(bottom - floor - LOWEST, s)
-            unheld *= _HIGHER + (1.0 - _HIGHER) * normal_share(floor + HIGHEST - bottom, s)
+        at_floor, below, unheld, hung = _of_heights(bottom, extents[i, 2], floor, s)
         usual = shares[i, 0] * at_floor + shares[i, 1] * hung
         largest, total, sunk, deepest, near, strange = 0.0, 0.0, below, -1, 0.0, 0.0
         of_anchor, usual_anchor, beside, level, carried = 0.0, 0.0, 0.0, 0.0, 0.0
-        told, enclosed = 0.0, 0.0
+        told, enclosed, over = 0.0, 0.0, 0.0
         for j in range(N):
             sizes = extents[j, 0] + extents[j, 1] + extents[j, 2]
             if i == j or supporters[N, j] == 0.0 or math.isnan(points[j, 2] + sizes):
@@ -134,7 +129,7 @@ def standing(
                 height = points[j, 2] - extents[j, 2] / 2 - floor
                 told += shares[j, 0] * math.exp(-0.5 * (height / error) ** 2)
             distance = math.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1])
-            weight = shares[j, 2] * math.exp(-0.5 * (distance / NEAR) ** 2)
+            weight = shares[j, 2] * math.exp(-0.5 * (distance / _NEAR) ** 2)
             beside += weight
             level += weight * _normal(lift + extents[j, 2], error)
             overlap = _overlap(boxes, i, j)
@@ -154,7 +149,7 @@ def standing(
             usual_at = shares[i, 2] * supporters[i, j] * density
             usual += usual_at
             strange += supporters[N, j] * density
-            lifted = normal_share(lift - LOWEST, error)
+            lifted = normal_share(lift - _LOWEST, error)
             over = max(over, overlap * lifted * min(supporters[i, j] / _USUAL, 1.0))
             total += density
             near += overlap
@@ -162,7 +157,7 @@ def standing(
             if likely > largest:
                 largest, anchor[i], of_anchor, usual_anchor = likely, j, density, usual_at
             deep = overlap * normal_share(-lift - 2 * error, error) * inside * (1.0 - within[j])
-            if deep > sunk and supporters[i, j] > 0.0:
+            if deep > sunk:
                 sunk, deepest = deep, j
         shared = (1.0 + level / uniform) / (1.0 + beside)
         unheld *= carried + (1.0 - carried) * shared
@@ -172,14 +167,7 @@ def standing(
         wrong = np.array([at_floor, strange, (1.0 - below) * uniform, sunk * uniform])
         for place in range(4):
             wrong[place] *= WRONG[place]
-        # An object that touches another one does not float, however rare such a supporter is.
-        shown = wrong.copy()
-        shown[ON_OBJECT] = WRONG[ON_OBJECT] * total / max(near, 1.0)
-        reason[i] = shown.argmax()
-        if reason[i] == FLOATS and sunk > 0.5:
-            reason[i] = SUNK
-        if reason[i] == FLOATS and told < _TOLD:
-            reason[i] = -1
+        reason[i] = _reason(wrong, WRONG[ON_OBJECT] * total / max(near, 1.0), sunk, told)
         if reason[i] == SUNK:
             anchor[i] = deepest
         elif reason[i] != ON_OBJECT:
@@ -188,6 +176,41 @@ def standing(
         held[i] = of_anchor / max(of_anchor + usual - usual_anchor, _LEAST)
         log_ratio[i] = math.log(max(wrong.sum(), _LEAST) / max(usual, _LEAST))
     return log_ratio, reason, anchor, held
+
+
+@inlined
+def _of_heights(bottom, height, floor, s):
+    """Return likelihoods that need no other object: floor, below it, unlisted object, and wall.
+
+    Where no object shows the floor (NaN), nothing is on it or below it.
+    """
+    uniform = 1.0 / ROOM
+    if math.isnan(floor):
+        return 0.0, 0.0, uniform, uniform
+    b = bottom - floor
+    on_wall = uniform * normal_share(b, s) / 2 + _normal(b + height - HUNG, HUNG_STD) / 2
+    if height >= _LONG:
+        on_wall = (on_wall + _normal(b, max(s, _LONG_STD))) / 2
+    higher = _HIGHER + (1.0 - _HIGHER) * normal_share(_HIGHEST - b, s)
+    on_unlisted = uniform * normal_share(b - _LOWEST, s) * higher
+    return _normal(b, s), normal_share(-2 * s - b, s), on_unlisted, on_wall
+
+
+@inlined
+def _reason(wrong, on_object, sunk, told):
+    """Return the likeliest wrong place, or -1 if a box floats over a floor that none shows.
+
+    An object that touches another one does not float, however rare such a supporter is, so the
+    likelihood on an object is that of any supporter.
+    """
+    reason, largest = ON_FLOOR, wrong[ON_FLOOR]
+    for place in (ON_OBJECT, FLOATS, SUNK):
+        likelihood = on_object if place == ON_OBJECT else wrong[place]
+        if likelihood > largest:
+            reason, largest = place, likelihood
+    if reason == FLOATS and sunk > 0.5:
+        return SUNK
+    return -1 if reason == FLOATS and told < _TOLD else reason
 
 
 @compiled

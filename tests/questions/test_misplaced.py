@@ -351,6 +351,18 @@ def test_furniture_whose_lower_part_is_hidden_reaches_the_floor(bottom):
     assert entries(seen_part(pot, 0.7, 0.75))[ABOVE, 0, -1][0] == UNHELD
 
 
+def test_tops_show_the_floor_if_no_whole_box_does():
+    """Two tops of desks at .75 m, and a pot between them and the floor."""
+    things = posed((DESK, (0, 0, 0)), (DESK, (9, 0, 0)), (POT, (20, 0, 0.3))).objects
+    tops = [
+        replace(thing, position=(*thing.position[:2], 0.725), size=(1.6, 0.8, 0.05))
+        for thing in things[:2]
+    ]
+    scene = observe(Scene((replace(tops[0], id="a"), replace(tops[1], id="b"), things[2])))
+    kinds = {mover: kind for kind, _, mover in entries(scene).values()}
+    assert kinds == {0: POSED, 1: POSED, 2: UNHELD}
+
+
 def test_a_small_thing_of_a_large_kind_is_not_stretched():
     """A bin of 10 cm on the desk is on it, although bins are .4 m high."""
     scene = posed((BIN, (0, 0, 0.75)), (DESK, (0, 0, 0)), *OTHERS)

@@ -32,6 +32,11 @@ VOCABULARY = Vocabulary(
 )
 MODEL = replace(larger_artifact("triway"), vocabulary=VOCABULARY)
 STANDS = MODEL.places.stands.argmax(1)
+SMALL_RUG = [
+    replace(entry, size=(0.1, 0.05, 0.01)) if entry.label == "rug" else entry
+    for entry in VOCABULARY.objects
+]
+FLAT_RUG = replace(MODEL, vocabulary=Vocabulary(SMALL_RUG, ("bedroom", "office")))
 
 
 def box(name, x, y, bottom=0.0, size=None, yaw=0.0):
@@ -336,6 +341,19 @@ def test_things_lie_on_the_seat_below_a_back():
         assert spot[2] + height / 2 - 0.15 == pytest.approx(bottom)
     for other in (seat_model(0.2, 0.5, 50), seat_model(0.2, 0.05, 5), seat_model(0.5, 0.05, 50)):
         assert np.isinf(other.seats).all()
+
+
+@pytest.mark.parametrize(("bottom", "height"), [(0.0, 0.01), (0.03, 0.03), (0.045, 0.01)])
+def test_a_rug_above_the_floor_takes_no_spot(bottom, height):
+    rug = box("rug", 2, 0, bottom, (8.0, 8.0, height))
+    assert spot_of(scene_of(box("sofa", 2, 0), rug), "left", CHAIR, 0) is not None
+
+
+def test_a_thing_just_above_a_surface_takes_its_spot():
+    """A simulator puts a vase 4 cm above the desk, so a flat thing would fit below it."""
+    desk, vase = box("desk", 2, 0), box("vase", 2, 0, 0.79, (0.3, 0.3, 0.3))
+    spot, _ = spot_of(scene_of(desk, vase), "on-top", RUG, 0, (0.0, 0.0, 0.4), model=FLAT_RUG)
+    assert max(abs(spot[0]), abs(spot[1])) > 0.15
 
 
 def test_a_kind_has_the_seat_of_its_broader_class():

@@ -148,6 +148,36 @@ def test_a_single_box_cannot_show_the_floor_and_lie_wrong_on_it():
     assert judge(("cup", 0, 0, 0), ("bed", 5, 0, 0)).reason.tolist() == [ON_FLOOR, -1]
 
 
+def test_a_box_high_above_the_floor_is_that_of_a_hand_computation():
+    """A cup that reaches 10 cm into a pillow near its edge, 3 m above the floor of two pieces."""
+    at = judge(
+        ("cup", 0.05, 0, 3.0), ("pillow", 0.3, 0, 2.95), ("bed", 5, 0, 0), ("table", 9, 0, 0)
+    )
+    s, of_pillow = math.hypot(ERROR, 0.1 * ERROR), math.hypot(ERROR, 0.15 * ERROR)
+    error, lift = math.hypot(s, of_pillow), 3.0 - 3.1
+    # The cup covers x from .01 to .09, and the pillow from 0 to .6: it is within by 1 cm.
+    overlap = share((1 - 0.3) * 0.08 + 0.01, math.hypot(ERROR, ERROR))
+    inside = share(-lift, error) * share(lift + 0.15, error)
+    density = overlap * (0.9 * normal(lift, error) + 0.1 * inside / 0.15)
+    thick = 1 - math.exp(-0.5 * (0.15 / error) ** 2)
+    carried = overlap * max(thick * math.exp(-0.5 * (lift / error) ** 2), 0.0)
+    beside = 0.96 * math.exp(-0.5 * (0.25 / 0.5) ** 2)
+    level = (1 + beside * ROOM * normal(0.05, error)) / (1 + beside)
+    higher = 0.25 + 0.75 * share(2.0 - 3.0, s)
+    unlisted = higher / ROOM * (carried + (1 - carried) * level)
+    hung = 1 / ROOM / 2 + normal(3.1 - HUNG, HUNG_STD) / 2
+    # Of the supporters of cups, half are tables, and 1 % each of the other classes.
+    total = 0.53 + 0.3 * 0.47
+    usual = 0.015 * hung + 0.98 * (0.01 * density + 0.3 * 0.47 * unlisted) / total
+    total = 0.42 + 0.3 * 0.58
+    strange = (0.01 * density + 0.3 * 0.58 * unlisted) / total
+    sunk = overlap * share(-2 * error - lift, error) * inside / ROOM
+    wrong = np.array(WRONG) * [0.0, strange, 1 / ROOM, sunk]
+    assert at.log_ratio[0] == pytest.approx(math.log(wrong.sum() / usual), abs=1e-4)
+    # Both pieces show the floor, so it counts as shown: the sum of their shares is at most 1.
+    assert at.reason[0] == (ON_OBJECT if WRONG[ON_OBJECT] * density > wrong[FLOATS] else FLOATS)
+
+
 RIGHT = [
     # The curtain reaches the floor, and the window is behind it.
     (("window", 0, 0, 0.9), ("curtain", 0, 0.05, 0.02)),

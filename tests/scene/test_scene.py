@@ -269,6 +269,12 @@ def test_a_table_top_is_not_the_floor() -> None:
     # Two lamps and a pot on a bed show its top, and the bed shows the floor.
     on_bed, stands = np.array([0.0, 1.0, 1.0, 1.0]), np.array([0.9, 0.2, 0.2, 0.5])
     assert floor_level(on_bed, stands, np.full(4, 0.05)) == 0.0
+    # A bin .8 m below a plant shows the floor, although a surface explains the plant better.
+    shares, peak = np.array([0.6, 0.9]), 1 / (0.05 * math.sqrt(2 * math.pi))
+    floor = math.log(0.6 * peak + 0.4 * (0.4 + 0.05)) + math.log(0.4 * 0.05)
+    surface = math.log(0.2 * peak + 0.4 * (0.2 + 0.05)) + math.log(0.4 * (0.05 + 0.9 + 0.05))
+    assert surface > floor
+    assert floor_level(np.array([0.8, 0.0]), shares, errors[:2]) == 0.0
     # A plant beside a spoon, by hand.
     shares, peak = np.array([0.6, 0.01]), 1 / (0.05 * math.sqrt(2 * math.pi))
     floor = math.log(0.6 * peak + 0.4 * (0.4 + 0.05)) + math.log(0.01 * peak + 0.4 * (0.99 + 0.05))
@@ -296,6 +302,14 @@ def test_the_floor_is_the_bottom_of_a_candidate(boxes):
     level = floor_level(bottoms, shares, errors)
     candidates = bottoms[shares >= 0.5]
     assert math.isnan(level) or level in candidates
+    alone = [
+        floor_level(bottoms[k : k + 1], shares[k : k + 1], errors[k : k + 1])
+        for k in range(len(bottoms))
+    ]
+    assert all(
+        math.isnan(x) if share < 0.5 else x == b
+        for x, b, share in zip(alone, bottoms, shares, strict=True)
+    )
 
 
 def test_the_floor_is_unknown_without_objects_that_stand_on_it() -> None:
