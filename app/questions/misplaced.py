@@ -333,8 +333,7 @@ def misplaced_fields(
     without structure and stacks of one class. Other entries about boxes need at least
     `LEAST_LISTED`, or an alarm. The most probably wrong entry comes first. Equal probabilities keep
     the order of `Scene.triples`, or of the objects. An object under another object is the subject
-    of its entry.
-    `scene_client.schemas.MisplacedRelation` defines the fields.
+    of its entry. `scene_client.schemas.MisplacedRelation` defines the fields.
     """
     entries = entries_of(model, posterior, scene)
     n = len(entries.kind)

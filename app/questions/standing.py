@@ -15,12 +15,13 @@ likelihood of b, per metre (N: normal with the error s, or rarely 3 s; U: 1 / `R
     sunk in     U, if the box reaches below the floor or into an object, unless into a shelf
 
 Things at wrong places are on or in the supporters of any things, or on the floor, but not inside a
-container there. The shares S of the floor of the other boxes at its height, at most 1 in sum, weigh
-this wrong place, because a single box cannot show the floor and lie wrong on it. k is the share of
-things far below the top of such an object: on a seat, or on the boards of a shelf
-(`Places.within`). The usual places of the class have the shares S of floor, wall and support, and q
-of its supporters. An object above a usual supporter is not on an unlisted object. Objects at wrong
-places have the shares `WRONG`. The evidence of a wrong place is the log ratio
+container there. This wrong place counts as far as other boxes at the height of the floor show it:
+by the sum of their shares S of the floor, at most 1. So no single box shows the floor and lies
+wrong on it. k is the share of things far below the top of such an object: on a seat, or on the
+boards of a shelf (`Places.within`). The usual places of the class have the shares S of floor, wall
+and support, and q of its supporters. An object above a usual supporter is not on an unlisted
+object. Objects at wrong places have the shares `WRONG`. The evidence of a wrong place is the log
+ratio
 
     t = log Σ wrong share · likelihood - log Σ usual share · likelihood
 
@@ -182,7 +183,7 @@ def standing(
 def _of_heights(bottom, height, floor, s):
     """Return likelihoods that need no other object: floor, below it, unlisted object, and wall.
 
-    Where no object shows the floor (NaN), nothing is on it or below it.
+    Without a height of the floor (NaN), the first two are 0.
     """
     uniform = 1.0 / ROOM
     if math.isnan(floor):

@@ -9,6 +9,7 @@ import pytest
 
 from app.model import Possibility
 from app.model.calibration import WEIGHTS, Judgement
+from app.model.possibility import CONTAINER
 from app.questions.misplaced import (
     BELOW,
     BESIDE,
@@ -349,6 +350,20 @@ def test_furniture_whose_lower_part_is_hidden_reaches_the_floor(bottom):
     assert entries(seen_part(desk, bottom + 0.6, 1.35))[ABOVE, 0, -1][0] == UNHELD
     pot = posed((POT, (0, 0, 0)), *OTHERS)
     assert entries(seen_part(pot, 0.7, 0.75))[ABOVE, 0, -1][0] == UNHELD
+
+
+def test_things_in_a_described_container_are_not_on_the_floor():
+    """The table of descriptions tells which classes are containers."""
+    traits = POSSIBILITY.traits.copy()
+    traits[SHELF, CONTAINER] = 1.0
+    container = replace(WITH_PRIOR, possibility=replace(POSSIBILITY, traits=traits))
+    assert container.containers.nonzero()[0].tolist() == [SHELF]
+    scene = posed((MONITOR, (0, 0, 0.02)), (SHELF, (0, 0, 0)), (STOVE, (9, 0, 0)))
+    on_floor, inside = (
+        entries(scene, artifact=artifact)[ON_TOP, 0, -1][1][2]
+        for artifact in (WITH_PRIOR, container)
+    )
+    assert inside > on_floor + 0.5  # -t
 
 
 def test_tops_show_the_floor_if_no_whole_box_does():
