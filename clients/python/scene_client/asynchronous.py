@@ -139,6 +139,26 @@ class AsyncClient:
         """Ask `rooms` about up to 256 scenes. Each scene has its own answer or problem."""
         return await self._call(calls.ROOMS.batch(scenes, self.options.model), timeout)
 
+    async def where(
+        self,
+        label: str,
+        rooms: Iterable[schemas.HomeRoom | schemas.Body],
+        *,
+        timeout: float | None = None,
+        **fields: Unpack[schemas.WhereFields],
+    ) -> schemas.WhereAnswer:
+        """Return the likely rooms and places of one thing in a home."""
+        return await self._call(calls.where(label, rooms, fields, self.options.model), timeout)
+
+    async def where_batch(
+        self,
+        requests: Iterable[schemas.WhereRequest | schemas.Body],
+        *,
+        timeout: float | None = None,
+    ) -> schemas.BatchAnswer[schemas.WhereAnswer]:
+        """Ask `where` up to 256 times. Each request has its own answer or problem."""
+        return await self._call(calls.where_batch(requests, self.options.model), timeout)
+
     async def models(self, *, timeout: float | None = None) -> schemas.ModelList:
         """Return the models of the service, their versions and their aliases."""
         return await self._call(Call("GET", "/models", schemas.ModelList), timeout)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
 from itertools import compress
@@ -148,9 +148,7 @@ class Question(Generic[RequestT, AnswerT]):
             _request(self.form, scene, {}, model, ("scenes", index))
             for index, scene in enumerate(scenes)
         )
-        if not 1 <= len(requests) <= schemas.MAX_BATCH:
-            message = f"a batch must contain from 1 to {schemas.MAX_BATCH} scenes"
-            raise InvalidRequestError.about(message, "#/scenes")
+        _check_size(requests)
         answers = schemas.BatchAnswer[self.answer]  # type: ignore[name-defined]
         body = f'{{"scenes":[{",".join(map(_json, requests))}]}}'
         return Call("POST", f"{self.path}/batch", answers, body, scenes=requests)
@@ -161,6 +159,50 @@ MISSING: Final = Question("/missing", schemas.MissingRequest, schemas.MissingAns
 OUTLIERS: Final = Question("/outliers", schemas.OutliersRequest, schemas.OutliersAnswer)
 ROOMS: Final = Question("/rooms", schemas.RoomsRequest, schemas.RoomsAnswer)
 GENERATE: Final = Question("/generate", schemas.GenerateRequest, schemas.GenerateAnswer, False)
+
+
+def where(
+    label: str, rooms: Iterable[Any], fields: Mapping[str, Any], model: str | None
+) -> Call[schemas.WhereAnswer]:
+    """Build the question where a thing is.
+
+    Raises:
+        InvalidRequestError: the request is invalid.
+    """
+    request = _where({"label": label, "rooms": rooms, **fields}, model)
+    return Call("POST", "/where", schemas.WhereAnswer, _json(request))
+
+
+def where_batch(
+    requests: Iterable[Any], model: str | None
+) -> Call[schemas.BatchAnswer[schemas.WhereAnswer]]:
+    """Build many questions where a thing is.
+
+    Raises:
+        InvalidRequestError: the batch or one of its requests is invalid.
+    """
+    checked = [
+        _where(dict(_json_value(one)), model, ("scenes", k)) for k, one in enumerate(requests)
+    ]
+    _check_size(checked)
+    body = f'{{"scenes":[{",".join(map(_json, checked))}]}}'
+    return Call("POST", "/where/batch", schemas.BatchAnswer[schemas.WhereAnswer], body)
+
+
+def _where(
+    fields: dict[str, Any], model: str | None, at: tuple[str | int, ...] = ()
+) -> schemas.WhereRequest:
+    if model is not None:
+        fields.setdefault("model", model)
+    members = {name: _json_value(value) for name, value in fields.items()}
+    return validated(schemas.WhereRequest, members, at)
+
+
+def _check_size(requests: Sequence[object]) -> None:
+    """Refuse an empty or too long batch."""
+    if not 1 <= len(requests) <= schemas.MAX_BATCH:
+        message = f"a batch must contain from 1 to {schemas.MAX_BATCH} scenes"
+        raise InvalidRequestError.about(message, "#/scenes")
 
 
 def _json(request: BaseModel) -> str:
@@ -193,7 +235,7 @@ def _json_value(value: Any) -> Any:
     if isinstance(value, BaseModel):
         return value.model_dump(exclude_unset=True)
     if isinstance(value, Mapping):
-        return dict(value)
+        return {name: _json_value(entry) for name, entry in value.items()}
     if isinstance(value, Iterable) and not isinstance(value, str):
         return [_json_value(entry) for entry in value]
     return value

@@ -14,3 +14,4 @@ from scene_client.schemas.relations import *  # noqa: F403
 from scene_client.schemas.requests import *  # noqa: F403
 from scene_client.schemas.rooms import *  # noqa: F403
 from scene_client.schemas.scenes import *  # noqa: F403
+from scene_client.schemas.where import *  # noqa: F403

@@ -109,8 +109,15 @@ class Mapped(Reply):
 
 WarningCode = Literal[
     "convention", "implausible-position", "implausible-size", "flat-scene", "unknown-sizes",
-    "not-judged",
+    "not-judged", "several-rooms",
 ]  # fmt: skip
+
+
+class RoomPart(Reply):
+    """The objects of a scene that are probably in one room, named by id."""
+
+    room_type: str
+    objects: list[str]
 
 
 class SceneWarning(Reply):
@@ -123,13 +130,36 @@ class SceneWarning(Reply):
     same depth in an optical frame. unknown-sizes: vertical relations of an object are unobserved,
     because its size is unknown. not-judged: the model has too few training scenes to judge objects
     or relations, and the list is empty; or too few of them show the class of an object, and the
-    object is no outlier; or the scene lists a single class, and no object is an outlier"""
+    object is no outlier; or the scene lists a single class, and no object is an outlier.
+    several-rooms: the objects are probably from several rooms, which `rooms` names. The answers are
+    about one room, so ask about each room in a request of its own"""
     message: str
     objects: list[str]
     """ids of the objects that the warning concerns; empty for the whole scene"""
     declare: dict[str, str] | None = None
     """for `convention`: the fields of a request that declare the likeliest convention, such as
     `{"up": "y"}`; empty if no field does"""
+    rooms: list[RoomPart] | None = None
+    """for `several-rooms`: the objects of each room"""
+
+
+class LabelProbability(Reply):
+    """A label of the vocabulary, and the probability that the object has it."""
+
+    label: str
+    probability: Probability
+
+
+class Resolved(Reply):
+    """The label of an object with `alternatives`, as the other objects of the scene decide.
+
+    The answer uses the first label. Its confidence is the sum of the confidences of all labels, at
+    most 1, multiplied by its probability.
+    """
+
+    object: str
+    labels: list[LabelProbability]
+    """known labels of the object, likeliest first. The probabilities sum to 1"""
 
 
 class Answer(Reply):
@@ -154,6 +184,8 @@ class Answer(Reply):
     """probable mistakes in the scene"""
     observed_relations: list[ObservedRelation] | None = None
     """relations derived from positions; absent without positions"""
+    resolved: list[Resolved] | None = None
+    """objects with `alternatives`; absent without any"""
 
 
 class ScoredRelation(Reply):

@@ -31,12 +31,16 @@ class OutliersRequest(SceneRequest):
     """`scores` leaves `because` and `usually_with` out of the answer"""
 
 
-class Outlier(Reply):
-    """Result for one object: whether the object fits the scene.
+Verdict = Literal["does-not-belong", "misdetection"]
 
-    `probability` is the probability that the object does not belong in the scene, under the
-    assumption that half of all scenes contain an outlier. `log_odds` is ln(p / (1 - p)) of this
-    probability p.
+
+class Outlier(Reply):
+    """Result for one object: whether the object fits the scene, and whether it is real.
+
+    `probability` is the probability that the object does not belong in the scene if it is real,
+    under the assumption that half of all scenes contain an outlier. `log_odds` is ln(p / (1 - p))
+    of this probability p. `real` is the probability that object and label are right, from the
+    confidence of the detector and from the other objects.
     """
 
     object: str
@@ -49,10 +53,14 @@ class Outlier(Reply):
     probability: Probability
     log_odds: Finite | None = None
     """absent for an object of probability 0, which is not judged"""
+    real: Probability = 1.0
+    """1 for an object of confidence 1. A weak detection that does not fit is probably wrong"""
     is_outlier: bool
-    """true if `probability` reaches the threshold. At a `sensitivity`, objects of a class that few
+    """true if `probability` reaches the threshold, and `real` is at least 0.5. At a `sensitivity`, objects of a class that few
     training scenes show are never outliers, and objects of a single class never are; the warning
     `not-judged` names them"""
+    reason: Verdict | None = None
+    """`does-not-belong` for an outlier; `misdetection` if `real` is below 0.5; else absent"""
     because: list[Because] = []
     """other objects that explain `is_outlier`, largest effect first, at most 3. For an outlier,
     they raise its log-odds. Otherwise, they lower its log-odds"""

@@ -189,6 +189,14 @@ class Stamp(Request):
     nanosec: Annotated[int, Field(ge=0, le=999_999_999)]
 
 
+class LabelGuess(Request):
+    """Another label that a detector gives an object."""
+
+    label: Label
+    confidence: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
+    """probability of this label"""
+
+
 class Detection(Request):
     """One detected object."""
 
@@ -198,7 +206,10 @@ class Detection(Request):
     label: Label
     """label in any spelling that the vocabulary accepts"""
     confidence: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 1.0
-    """probability that the object exists"""
+    """confidence of the detector in object and label, as a probability"""
+    alternatives: Annotated[list[LabelGuess], Field(max_length=8)] = []
+    """other labels that the detector gives this object. The other objects of the scene decide among
+    the labels; the answer lists the decision in `resolved`"""
     position: Annotated[Position, OrArray()] | None = None
     """centre of the object's box, or its `box_origin`"""
     size: Annotated[Size, OrArray()] | None = None
