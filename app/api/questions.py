@@ -18,6 +18,7 @@ from app.api.openapi import error_responses, operation_id
 from app.api.problems import from_exception
 from app.errors import AnswerTooLargeError, LocatedError, RequestError
 from app.questions import QUESTIONS, Question
+from app.questions.alternatives import label_probabilities
 from app.questions.answer import Fields, envelope, written_within
 from app.questions.generate import STEPS
 from app.questions.names import LookUps, new_labels
@@ -124,6 +125,7 @@ def _read(
         spread=model.spread,
         stands=None if model.places is None else model.places.stands,
         profiles=artifact.manifest.vocabulary.profiles,
+        decide=lambda words, *about: label_probabilities(model.with_words(words), *about),
         may_be_empty=question.samples,
     )
     options = question.read(scene, model, reading)

@@ -153,6 +153,34 @@ class ObjectScorer:
         bias = weights["b"] + weights.room_couplings(room) + weights["kappa"][-1]
         return self._explained(bias, scene, profile, rows, scene.classes, explained=explained)
 
+    def given_others(
+        self,
+        classes: Int[NDArray, " n"],
+        presence: Float[NDArray, "B n"],
+        row: Int[NDArray, " T"],
+        targets: Int[NDArray, " T"],
+        profile: int | None,
+        room: int | None = None,
+    ) -> Float[NDArray, " T"]:
+        """Return the log-odds of T target classes in B scenes with some of n distinct classes.
+
+        Target t is in the scene `row[t]`. The presence of the target class itself does not count.
+        """
+        weights, W = self._weights, self._weights["W"]
+        v = np.where(classes == targets[:, None], np.float32(0), presence[row])  # (T, n)
+        p = all_states(weights.room_bias(room) + v @ W[classes], self._states)
+        shape = len(targets), p.shape[1], self._states - 1
+        raised = np.exp(W[targets]).reshape(shape)
+        log_odds = _hidden_changes(p, raised, raised[:0])[0]
+        bias = weights["b"] + weights.room_couplings(room) + weights["kappa"][-1]
+        log_odds += bias[targets]
+        if weights.spec.profiles:
+            of_source = weights.source_weights(classes, v, profile)
+            log_odds += (of_source * weights["a"][:, targets].T).sum(1).astype(np.float32)
+        if weights.spec.coupled:
+            log_odds += (v * weights["L"][targets[:, None], classes]).sum(1)
+        return log_odds
+
     def reasons_for_absent(
         self, scene: EncodedScene, profile: int | None, candidates: Int[NDArray, " N"]
     ) -> Float[NDArray, "N n"]:

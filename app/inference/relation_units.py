@@ -15,7 +15,7 @@ base and U. Each unit of `FreeUnits` has its own row of U. `SharedUnits` compute
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final, NamedTuple
 
@@ -69,6 +69,12 @@ class EncodedScene:
     x: Float[NDArray, " H1"]  # logits of h1 given the classes and the room type
     contributions: Float[NDArray, "n H1"]  # of each class to x
     observed: ObservedRelations | None
+
+    def weighted(self, presence: Float[NDArray, " n"]) -> "EncodedScene":
+        """Return the scene with another presence of its classes, which is above 0 here."""
+        contributions = self.contributions * (presence / self.presence)[:, None]
+        x = self.x + (contributions - self.contributions).sum(0)
+        return replace(self, presence=presence, x=x, contributions=contributions)
 
 
 def encode(

@@ -11,8 +11,10 @@ from app.model.calibration import (
     CoverageFit,
     FitLimit,
     Judgement,
+    LabelFit,
     Misplaced,
     PlaceFit,
+    RealFit,
     Sensitivity,
     Sharpness,
 )
@@ -22,6 +24,6 @@ from app.model.statistics import Counts, Offsets, Places
 
 __all__ = [
     "AlarmLine", "AlarmLines", "Calibration", "CountSlope", "Counts", "CoverageFit", "FitLimit",
-    "Judgement", "Misplaced", "Offsets", "PlaceFit", "Places", "Possibility", "SceneModel",
-    "Sensitivity", "Sharpness",
+    "Judgement", "LabelFit", "Misplaced", "Offsets", "PlaceFit", "Places", "Possibility",
+    "RealFit", "SceneModel", "Sensitivity", "Sharpness",
 ]  # fmt: skip

@@ -46,6 +46,33 @@ class CoverageFit(CountSlope):
 
 LEAST_COVERAGE: Final = 0.15  # least share of a scene that the base rates of `/missing` tell apart
 
+
+class RealFit(Frozen):
+    """The log-odds that a detection is right: object and label.
+
+    With the confidence c of the detector and the score s of the class given the other n - 1 listed
+    classes, they are intercept + confidence·logit(c) + context·s + log_count·log n. s is the
+    log-odds of the class minus its prior as an intruder. `training.fit.calibrate_doubt` states the
+    model of detectors.
+    """
+
+    intercept: float
+    confidence: Annotated[float, Field(ge=0)]
+    context: Annotated[float, Field(ge=0)]
+    log_count: float
+
+
+class LabelFit(Frozen):
+    """The logit of one of several labels of an object: confidence·logit(c) + context·z.
+
+    c is the confidence of the label, and z are the log-odds of its class given the other objects.
+    The probabilities of the labels are the softmax of their logits.
+    """
+
+    confidence: Annotated[float, Field(ge=0)] = 1.0
+    context: Annotated[float, Field(ge=0)] = 1.0
+
+
 PairSlopes = Annotated[Many[CountSlope], Field(max_length=len(CANONICAL))]
 
 PAIR_CALIBRATIONS: Final = ("relation", "relation_given", "placement")
@@ -207,6 +234,8 @@ class Calibration(Frozen):
     # From log-odds of presence to log-odds of an intruder. None: training had too few scenes for
     # the fit, so the model judges no object.
     outlier: CountSlope | None = None
+    real: RealFit | None = None  # None: the confidence is the probability that a detection is right
+    labels: LabelFit = LabelFit()  # decision among the labels of an object with alternatives
     # Calibrations of each canonical relation: without and with observed relations, and for a
     # missing object at its most probable places, and at the place that a request names.
     relation: PairSlopes

@@ -50,6 +50,14 @@ def envelope(
     fields["warnings"] = reading.warnings
     if reading.observed is not None:
         fields["observed_relations"] = reading.observed
+    if reading.resolved:
+        fields["resolved"] = [
+            {"object": name, "labels": [
+                {"label": label, "probability": rounded_number(value)}
+                for label, value in zip(labels, p, strict=True)
+            ]}
+            for name, labels, p in reading.resolved
+        ]  # fmt: skip
     return fields
 
 

@@ -48,6 +48,7 @@ from app.model.possibility import IN, ON, OVER, PRIOR_SHARE, UNDER, known_share
 from app.model.scene_model import SceneModel
 from app.model.statistics import Places
 from app.questions.answer import Fields, significant
+from app.questions.doubt import LEAST_REAL, Doubt
 from app.questions.posterior import Posterior
 from app.questions.standing import (
     FLOATS,
@@ -325,13 +326,14 @@ def _judged(model: SceneModel, entries: Entries) -> Iterator[tuple[Judgement, In
 
 
 def misplaced_fields(
-    model: SceneModel, posterior: Posterior, scene: Scene, sensitivity: Sensitivity
+    model: SceneModel, posterior: Posterior, scene: Scene, sensitivity: Sensitivity, about: Doubt
 ) -> list[Fields]:
     """Judge the stated relations, or the places of boxes.
 
     Every stated relation, and every support of boxes, of a kind that the model judges is listed,
     without structure and stacks of one class. Other entries about boxes need at least
-    `LEAST_LISTED`, or an alarm. The most probably wrong entry comes first. Equal probabilities keep
+    `LEAST_LISTED`, or an alarm. A wrong detection raises no alarm. The most probably wrong entry
+    comes first. Equal probabilities keep
     the order of `Scene.triples`, or of the objects. An object under another object is the subject
     of its entry. `scene_client.schemas.MisplacedRelation` defines the fields.
     """
@@ -348,12 +350,13 @@ def misplaced_fields(
     order = np.argsort(-log_odds, kind="stable")
     order = order[(is_relation | (p >= np.minimum(line, LEAST_LISTED)))[order]]
     ids = [thing.id for thing in scene.objects]
+    is_misplaced = (p >= line) & (about.real[entries.mover] >= LEAST_REAL)
     columns = (
         *(entries.triple[order].tolist(), entries.kind[order].tolist()),
-        *(significant(p[order]), (p >= line)[order].tolist(), entries.mover[order].tolist()),
+        *(significant(p[order]), is_misplaced[order].tolist(), entries.mover[order].tolist()),
     )
     fields: list[Fields] = []
-    for (relation, subject, object_), kind, probability, is_misplaced, mover in zip(
+    for (relation, subject, object_), kind, probability, is_alarm, mover in zip(
         *columns, strict=True
     ):
         name = CANONICAL[relation]
@@ -365,7 +368,7 @@ def misplaced_fields(
                 "relation": name,
                 "object": ids[object_] if object_ >= 0 else THE_FLOOR,
                 "probability": probability,
-                "is_misplaced": is_misplaced,
+                "is_misplaced": is_alarm,
                 "reason": _REASON_OF.get((relation, kind), "relation"),
                 "moved": ids[mover],
             }

@@ -18,6 +18,7 @@ from app.errors import InvalidRequestError
 from app.inference.elementary import sigmoid
 from app.model.scene_model import SceneModel
 from app.questions.answer import EXPLAINED, Fields, best, named, reasons, significant
+from app.questions.doubt import believed
 from app.questions.names import ErrorList
 from app.questions.placements import Place, place_log_p, placements
 from app.questions.posterior import (
@@ -82,7 +83,7 @@ def missing(
         'laptop'
     """
     place = None if at is None else Place.of(*at)
-    posterior = Posterior(model, scene)
+    posterior = believed(model, scene)
     calibration = model.calibration
     classes, log_odds, placed = _ranked(model, posterior, top_k, candidates, place, coverage)
     labels = model.vocabulary.labels

@@ -51,6 +51,12 @@ def new_labels(request: SceneRequest, vocabulary: Vocabulary) -> int:
     """
     searches = _SEARCHES[request.unknown_labels]
     labels = [entry if isinstance(entry, str) else entry.label for entry in request.objects]
+    labels += [
+        other.label
+        for entry in request.objects
+        if not isinstance(entry, str)
+        for other in entry.alternatives
+    ]
     new = sum(not vocabulary.remembers(label, searches) for label in labels)
     is_room = isinstance(request, RoomsRequest)
     candidates: Sequence[str] = getattr(request, "candidates", None) or ()

@@ -18,12 +18,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from app.inference.elementary import sigmoid
-from app.model.calibration import CountSlope, Sensitivity
+from app.model.calibration import Sensitivity
 from app.model.scene_model import SceneModel
 from app.questions.answer import EXPLAINED, Fields, best, reasons, rounded_number, significant
+from app.questions.doubt import LEAST_REAL, Doubt, doubt
 from app.questions.misplaced import misplaced_fields
-from app.questions.posterior import Posterior, calibrated
+from app.questions.posterior import Posterior
 from app.questions.question import REFUSED, SCENES, WITH_TOILET, Example, Options, Question
 from app.questions.reading import Reading
 from app.scene.scene import Scene, SceneObject
@@ -73,7 +73,6 @@ def outliers(
         >>> outliers(model, scene)["outliers"][0]["object"]
         'toilet'
     """
-    entry = model.calibration.outlier
     can_alarm = ~model.rarely_shown if threshold is None else np.ones_like(model.rarely_shown)
     can_alarm[model.vocabulary.trained :] = False
     judged: list[Fields] = []
@@ -84,12 +83,13 @@ def outliers(
         n, in_room = posterior.listed if posterior else 0, scene.room_type is not None
         threshold = model.calibration.outlier_threshold(sensitivity, n, in_room=in_room)
     if posterior is not None:
-        wrong = misplaced_fields(model, posterior, scene, sensitivity)
-        if entry is not None and threshold is not None:
-            judged, unsure = _judged(
-                model, entry, posterior, scene, threshold, can_alarm, details=details
-            )
-            warnings += _too_rare(model, unsure) + _alone(model, posterior, scene)
+        log_odds, change = posterior.given_rest(explained=details)
+        about = doubt(model, posterior, log_odds)
+        wrong = misplaced_fields(model, posterior, scene, sensitivity, about)
+        if model.calibration.outlier is not None and threshold is not None:
+            changes = change if details else None
+            judged, silent = _judged(model, posterior, scene, about, changes, threshold, can_alarm)
+            warnings += _too_rare(model, silent) + _alone(model, posterior, scene)
     fields: Fields = {"warnings": warnings}
     if threshold is not None:
         fields["threshold"] = rounded_number(threshold)
@@ -98,42 +98,45 @@ def outliers(
 
 def _judged(
     model: SceneModel,
-    entry: CountSlope,
     posterior: Posterior,
     scene: Scene,
+    about: Doubt,
+    change: Float[Floats, "n n"] | None,  # of log-odds by each class; None: without details
     threshold: float,
     can_alarm: Bool[NDArray[np.bool_], "V"],
-    *,
-    details: bool,
 ) -> tuple[list[Fields], list[SceneObject]]:
     """Return the fields of `scene_client.schemas.Outlier` for every object of a scene.
 
     The second result lists the objects that reach the threshold, but whose class raises no alarm.
     `because` lists the other objects with the strongest effects. These raise the `log_odds` of an
-    outlier, and lower those of other objects.
+    object that reaches the threshold, and lower those of other objects. Doubt about an object
+    reduces its effects.
     """
     present, vocabulary = posterior.present, model.vocabulary
     labels, broader = vocabulary.labels, vocabulary.broader_labels
-    log_odds, change = posterior.given_rest(explained=details)
-    logits, p = _intruder_odds(model, entry, posterior, log_odds)
+    logits, p, real, presence = about
     reaches = (p >= threshold) & (posterior.listed > 1)
-    is_outlier = reaches & can_alarm[present.classes]
+    may_alarm = reaches & can_alarm[present.classes]
     # The order follows the logits, because probabilities near 0 or 1 may round to the same number.
     order = (-logits[present.row]).argsort(kind="stable")
-    rows, flags, n = present.row[order].tolist(), is_outlier.tolist(), len(log_odds)
+    rows, flags, n = present.row[order].tolist(), may_alarm.tolist(), len(p)
     causes: list[list[Fields]] = [[] for _ in flags]
-    explained = set(rows[:EXPLAINED])
-    if details and n > 1:
-        lowered, raised = np.minimum(change, 0), np.maximum(change, 0)
-        change = np.where(is_outlier[:, None], lowered, raised)
-        causes = reasons(scene, present, change, np.arange(n), scale=entry.slope)
     companions: list[list[str]] = [[] for _ in flags]
-    judged: list[Fields] = []
+    explained = set(rows[:EXPLAINED])
     classes, probabilities, values = present.classes.tolist(), significant(p), significant(logits)
-    for row in explained if details else ():
-        if flags[row]:
-            companions[row] = _companions(model, present.classes, classes[row])
-    for number, row in zip(order.tolist(), rows, strict=True):
+    if change is not None and n > 1:
+        change = change * (presence / present.presence)
+        lowered, raised = np.minimum(change, 0), np.maximum(change, 0)
+        change = np.where(may_alarm[:, None], lowered, raised)
+        slope = model.calibration.outlier.slope  # type: ignore[union-attr]
+        causes = reasons(scene, present, change, np.arange(n), scale=slope)
+        for row in explained:
+            if flags[row]:
+                companions[row] = _companions(model, present.classes, classes[row])
+    judged: list[Fields] = []
+    numbers, unsure = order.tolist(), bool((real < 1.0).any())
+    certainty = significant(real[order]) if unsure else [1.0] * len(rows)
+    for number, row, certain in zip(numbers, rows, certainty, strict=True):
         thing = scene.objects[number]
         fields: Fields = {"object": thing.id, "label": labels[classes[row]]}
         if thing.label != fields["label"]:
@@ -143,13 +146,17 @@ def _judged(
         fields["probability"] = probabilities[row]
         if probabilities[row]:
             fields["log_odds"] = values[row]
-        fields["is_outlier"] = flags[row]
-        if details:
+        if unsure:
+            fields["real"] = certain
+        is_outlier = fields["is_outlier"] = flags[row] and certain >= LEAST_REAL
+        if is_outlier or certain < LEAST_REAL:
+            fields["reason"] = "does-not-belong" if is_outlier else "misdetection"
+        if change is not None:
             fields["because"] = causes[row] if row in explained else []
             fields["usually_with"] = companions[row]
         judged.append(fields)
-    unsure = np.flatnonzero((reaches & ~is_outlier)[present.row])
-    return judged, [scene.objects[number] for number in unsure.tolist()]
+    silent = np.flatnonzero((reaches & ~may_alarm)[present.row])
+    return judged, [scene.objects[number] for number in silent.tolist()]
 
 
 def misplaced(
@@ -165,7 +172,9 @@ def misplaced(
     """
     if not scene.objects:
         return []
-    return misplaced_fields(model, Posterior(model, scene), scene, sensitivity)
+    posterior = Posterior(model, scene)
+    about = doubt(model, posterior, posterior.given_rest()[0])
+    return misplaced_fields(model, posterior, scene, sensitivity, about)
 
 
 def intruders(model: SceneModel, scene: Scene) -> NDArray[np.int64]:
@@ -175,20 +184,8 @@ def intruders(model: SceneModel, scene: Scene) -> NDArray[np.int64]:
     threshold = calibration.outlier_threshold("medium", posterior.listed, in_room=in_room)
     if calibration.outlier is None or threshold is None:
         return classes[:0]
-    _, p = _intruder_odds(model, calibration.outlier, posterior, posterior.given_rest()[0])
+    p = doubt(model, posterior, posterior.given_rest()[0]).p
     return classes[(p >= threshold) & (posterior.listed > 1)]
-
-
-def _intruder_odds(
-    model: SceneModel, entry: CountSlope, posterior: Posterior, log_odds: Float[Floats, "n"]
-) -> tuple[Float[Floats, "n"], Float[Floats, "n"]]:
-    """Return logit and probability that each class is an intruder; -inf and 0 if not judged."""
-    classes = posterior.present.classes
-    adjusted = log_odds - model.intruder_prior[classes]
-    logits = calibrated(entry, adjusted, max(1, posterior.listed))
-    p, is_excused = sigmoid(logits), ~model.vocabulary.judged[classes]
-    logits[is_excused], p[is_excused] = -np.inf, 0.0
-    return logits, p
 
 
 def _companions(model: SceneModel, present: Int[NDArray[np.int64], "n"], flagged: int) -> list[str]:

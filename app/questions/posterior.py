@@ -44,6 +44,7 @@ class Present(NamedTuple):
     counts: Int[Indices, "n"]  # objects of each class
     row: Int[Indices, "N"]  # index in `classes` of each object's class
     first: Int[Indices, "n"]  # first object of each class in `Scene.objects`
+    confidence: Float[Doubles, "N"]  # of each object
     presence: Float[Singles, "n"]  # probability that at least one instance is present
     log_counts: Float[Singles, "n"]
     observed: ObservedRelations | None  # between the classes; None: without observations
@@ -73,7 +74,8 @@ def present(scene: Scene, spec: MachineSpec) -> Present:
     if scene.relations is not None:
         columns = scene.relations.of_classes(row, len(classes), spec.A)
     observed = None if columns is None else ObservedRelations(*columns)
-    return Present(classes, counts, row, first, presence.astype(np.float32), log_counts, observed)
+    single = presence.astype(np.float32)
+    return Present(classes, counts, row, first, confidence, single, log_counts, observed)
 
 
 class Posterior:
@@ -103,6 +105,12 @@ class Posterior:
         )
         self._objects, self.units = model.objects, model.relation_units
         self._profile, self._room = scene.profile, scene.room_type
+
+    def weight(self, presence: Float[Floats, "n"]) -> None:
+        """Replace the presence of the listed classes, before relations are asked."""
+        single = presence.astype(np.float32)
+        self.present = self.present._replace(presence=single)
+        self.context = self.context.weighted(single)
 
     def absent_log_odds(self, absent: Int[Indices, "N"], coverage: float) -> Float[Floats, "N"]:
         """Return the log-odds of unlisted classes, if the list has this share of the classes."""

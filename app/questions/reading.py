@@ -6,19 +6,20 @@ units, axes, extents, origins of boxes and orders of quaternions.
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import cached_property
 from itertools import compress, count
 from statistics import median
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
 from app.errors import ContradictionError, InvalidRequestError, Location
+from app.questions.alternatives import Guesses, read_guesses
 from app.questions.conventions import Alternative, evidence_of, fields_to_declare
 from app.questions.names import ErrorList, LookUps, Names, Unknown
 from app.scene.relation_table import RelationTable, Triple
@@ -34,7 +35,7 @@ from app.scene.scene import (
     observe,
 )
 from app.scene.spatial_relations import CANONICAL, canonicalise, support_cycle
-from app.scene.vocabulary import Extents, Vocabulary
+from app.scene.vocabulary import Extents, Vocabulary, Word
 from scene_client import schemas
 from scene_client.frames import METRES, Conventions, is_optical, is_world_fixed
 from scene_client.schemas import (
@@ -45,6 +46,11 @@ from scene_client.schemas import (
     SceneWarning,
 )
 from scene_client.schemas.answers import WarningCode
+
+Decide = Callable[[Sequence[Word], Scene, Mapping[int, Guesses]], dict[int, NDArray[Any]]]
+"""Function that returns the probabilities of the labels of objects: `label_probabilities`."""
+
+_LEAST_CONFIDENCE: Final = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +72,8 @@ class Reading:
     vocabulary: Vocabulary  # classes of the model, and of words that are read by their meaning
     observed: list[ObservedRelation] | None = None  # derived from poses; None: without poses
     warnings: list[SceneWarning] = field(default_factory=list)
+    # Ids of the objects with several labels; their classes, likeliest first, and probabilities.
+    resolved: list[tuple[str, list[str], list[float]]] = field(default_factory=list)
 
     @cached_property
     def names(self) -> Names:
@@ -83,6 +91,7 @@ def read_scene(
     spread: Float[NDArray[np.floating], "V"] | None = None,  # see `observe`
     stands: Float[NDArray[np.floating], "V 3"] | None = None,  # `Places.stands`
     profiles: Sequence[str] = (),  # names of the model's profiles
+    decide: Decide | None = None,  # among several labels of an object; None: the first label
     may_be_empty: bool = False,  # whether a scene without objects of known classes is valid
 ) -> Reading:
     """Convert the scene of a request: find the class of each label, and derive relations.
@@ -95,9 +104,10 @@ def read_scene(
     unknown = Unknown(vocabulary, request.unknown_labels, look_ups or LookUps())
     ids, left_out = _ids(request.objects, errors), list[tuple[str, str]]()
     detections: dict[int, Detection] = {}
+    guesses: dict[int, Guesses] = {}
     objects = vocabulary.bare_objects(ids) if ids == request.objects else None
     if objects is None:
-        objects, detections = _objects(request, ids, unknown, left_out, errors)
+        objects, detections = _objects(request, ids, unknown, left_out, errors, guesses)
     room, profile = None, None
     if (name := request.room_type) is not None:
         room = unknown.resolve(name, name, ("room_type",), errors, is_room=True)
@@ -110,7 +120,12 @@ def read_scene(
 
     if unknown.words:
         vocabulary = vocabulary.with_words(list(unknown.words.values()))
-    reading = Reading(Scene(objects, None, room, profile), unknown, left_out, vocabulary)
+    scene = Scene(objects, None, room, profile)
+    reading = Reading(scene, unknown, left_out, vocabulary)
+    if guesses and decide is not None:
+        p = decide(list(unknown.words.values()), scene, guesses)
+        _decide(reading, guesses, p, detections, request)
+        objects = reading.scene.objects
     entries = [entry for entry in request.objects if not isinstance(entry, str)]
     has_positions = len(entries) == len(ids) and all(item.position is not None for item in entries)
     has_supports = any(item.supported_by is not None for item in entries)
@@ -149,10 +164,12 @@ def _objects(
     unknown: Unknown,
     left_out: list[tuple[str, str]],
     errors: ErrorList,
+    guesses: dict[int, Guesses],
 ) -> tuple[tuple[SceneObject, ...], dict[int, Detection]]:
     """Return the objects of known classes with poses in body axes, and their detections by index.
 
-    Ignored objects are added to ``left_out``.
+    Ignored objects are added to ``left_out``, and objects with several labels to ``guesses``. Such
+    an object has its first known label.
     """
     try:
         conventions = Conventions.of(request, request.frame_id)
@@ -164,7 +181,13 @@ def _objects(
     for number, (name, entry) in enumerate(zip(ids, request.objects, strict=True)):
         at: Location = ("objects", number)
         label, at = (entry, at) if isinstance(entry, str) else (entry.label, (*at, "label"))
-        index = unknown.resolve(label, name, at, errors)
+        if not isinstance(entry, str) and entry.alternatives:
+            guess = read_guesses(entry, name, ("objects", number), unknown, errors)
+            label, index = (guess.labels[0], guess.classes[0]) if guess.classes else (label, None)
+            if len(guess.classes) > 1:
+                guesses[len(objects)] = guess
+        else:
+            index = unknown.resolve(label, name, at, errors)
         if index is None:
             left_out.append((name, label))
             if errors.by_class and errors.are_many:
@@ -173,14 +196,46 @@ def _objects(
             objects.append(SceneObject(name, label, index))
         else:
             detections[len(objects)] = entry
-            known = unknown.vocabulary.objects
-            typical = known[index].size if index < len(known) else None
             box = (
-                *_box(entry, conventions, typical),
+                *_box(entry, conventions, _typical_size(unknown.vocabulary, index)),
                 *conventions.errors(entry.position_std, entry.size_std),
             )
             objects.append(SceneObject(name, label, index, entry.confidence, *box))
     return tuple(objects), detections
+
+
+def _decide(
+    reading: Reading,
+    guesses: Mapping[int, Guesses],
+    probabilities: Mapping[int, Float[NDArray[np.floating], "n"]],
+    detections: Mapping[int, Detection],
+    request: SceneRequest,
+) -> None:
+    """Give each object with several labels the likeliest one."""
+    conventions = Conventions.of(request, request.frame_id)
+    objects, vocabulary = list(reading.scene.objects), reading.vocabulary
+    for row, p in probabilities.items():
+        guess, thing, order = guesses[row], objects[row], np.argsort(-p, kind="stable").tolist()
+        index, total = guess.classes[order[0]], min(1.0, sum(guess.confidence))
+        position, size, yaw = _box(detections[row], conventions, _typical_size(vocabulary, index))
+        objects[row] = replace(
+            thing,
+            label=guess.labels[order[0]],
+            class_index=index,
+            confidence=max(total * float(p[order[0]]), _LEAST_CONFIDENCE),
+            position=position,
+            size=size,
+            yaw=yaw,
+        )
+        labels = [vocabulary.labels[guess.classes[k]] for k in order]
+        reading.resolved.append((thing.id, labels, p[order].tolist()))
+    reading.scene = replace(reading.scene, objects=tuple(objects))
+
+
+def _typical_size(vocabulary: Vocabulary, index: int) -> Extents | None:
+    """Return the typical size of a class, None if unknown or of a word."""
+    known = vocabulary.objects
+    return known[index].size if index < len(known) else None
 
 
 def _box(

@@ -15,8 +15,9 @@ import numpy as np
 from app.inference.elementary import softmax
 from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, reasons, significant
+from app.questions.doubt import believed
 from app.questions.names import ErrorList
-from app.questions.posterior import LEAST_CHANGE, Posterior
+from app.questions.posterior import LEAST_CHANGE
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
 from app.questions.reading import Reading
 from app.scene.scene import Scene
@@ -46,7 +47,7 @@ def rooms(
     among = np.arange(C) if candidates is None else np.array([*candidates], dtype=np.int64)
     if not len(among):
         return {"warnings": [] if C else [_NO_ROOM_TYPES], "room_types": []}
-    posterior = Posterior(model, replace(scene, room_type=None))
+    posterior = believed(model, replace(scene, room_type=None))
     sharpness = model.calibration.rooms.of(posterior.listed)
     p = softmax(sharpness * posterior.room_log_p()[among])
     first = np.argsort(-p, kind="stable")[:top_k]

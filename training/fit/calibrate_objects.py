@@ -32,7 +32,7 @@ from torch import Tensor
 
 from app.model import AlarmLine, AlarmLines, Calibration, CountSlope, CoverageFit, SceneModel
 from app.model.calibration import LEAST_COVERAGE, LONGEST_JUDGED
-from app.questions.posterior import calibrated
+from app.questions.posterior import Posterior, calibrated
 from training.datasets.array_types import ClassMask
 from training.datasets.batches import SceneTensors, TrainingData, subset
 from training.evaluation.outlier_tasks import ALARMS, draw_intruders, intruder_weights
@@ -45,7 +45,14 @@ from training.evaluation.parts import (
     share_of,
     up_to_longest,
 )
-from training.fit.calibrate_rooms import calibrate_rooms, limits, of_sources, posterior_of
+from training.fit.calibrate_doubt import fit_doubt
+from training.fit.calibrate_rooms import (
+    calibrate_rooms,
+    limits,
+    listed_scene,
+    of_sources,
+    posterior_of,
+)
 from training.fit.configuration import ObjectsConfig
 from training.fit.regression import (
     LEAST_SCENES,
@@ -88,9 +95,10 @@ def calibrate_objects(
     learnt = complete_scenes(train, seed)
     rounded = tuple(None if math.isnan(x) else round(x, 4) for x in popularity.double().tolist())
     artifact = recalibrated(artifact, popularity=rounded)
-    artifact = recalibrated(artifact, **fit_missing(artifact, scenes, chosen))
-    entries = fit_outliers(artifact, scenes, learnt, chosen)
-    entries |= calibrate_rooms(artifact, scenes, learnt)
+    artifact = recalibrated(artifact, **fit_outliers(artifact, scenes, learnt, chosen))
+    artifact = recalibrated(artifact, **fit_doubt(artifact, scenes.scenes, seed))
+    # Other answers weight the listed objects by the doubt about them.
+    entries = fit_missing(artifact, scenes, chosen) | calibrate_rooms(artifact, scenes, learnt)
     return recalibrated(artifact, **entries).calibration
 
 
@@ -292,7 +300,7 @@ def score_lists(
     for k, (row, values) in enumerate(zip(v, log_odds, strict=True)):
         room = None if rooms is None else rooms[k]
         # The log-odds of each listed class given the other listed classes.
-        values[row] = posterior_of(artifact, torch.from_numpy(row), room).given_rest()[0]
+        values[row] = Posterior(artifact, listed_scene(torch.from_numpy(row), room)).given_rest()[0]
     row, classes = at = np.nonzero(v & judged_classes(artifact))
     can_alarm = ~artifact.rarely_shown[classes]
     return ListScores(row, log_odds[at], popularity[classes], is_intruder[at], can_alarm, v.sum(1))

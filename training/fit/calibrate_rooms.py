@@ -25,8 +25,10 @@ from torch import Tensor
 from app.inference.chains import random_stream
 from app.model import FitLimit, SceneModel, Sharpness
 from app.model.calibration import NO_LIMIT
+from app.questions.doubt import believed
 from app.questions.generate import STEPS, room_fit
 from app.questions.posterior import Posterior
+from app.scene import Scene
 from training.datasets.array_types import Table
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.sources import source_of
@@ -81,9 +83,13 @@ def fit_rooms(artifact: SceneModel, scenes: SceneTensors) -> Sharpness:
 
 
 def posterior_of(artifact: SceneModel, v: Float[Tensor, "V"], room: int | None = None) -> Posterior:
-    """Return the posterior given the listed classes v and the room type."""
-    scene = of_classes(v.nonzero().squeeze(1).tolist())
-    return Posterior(artifact, replace(scene, room_type=room))
+    """Return the posterior given the listed classes v and the room type, weighted by doubt."""
+    return believed(artifact, listed_scene(v, room))
+
+
+def listed_scene(v: Float[Tensor, "V"], room: int | None = None) -> Scene:
+    """Return a scene with one object of each listed class."""
+    return replace(of_classes(v.nonzero().squeeze(1).tolist()), room_type=room)
 
 
 def of_sources(scenes: SceneTensors, attribute: str) -> Bool[Tensor, "B"]:

@@ -54,7 +54,8 @@ class Outlier(Reply):
     log_odds: Finite | None = None
     """absent for an object of probability 0, which is not judged"""
     real: Probability = 1.0
-    """1 for an object of confidence 1. A weak detection that does not fit is probably wrong"""
+    """a weak detection that does not fit is probably wrong. Absent if all objects have confidence 1,
+    which counts as certain"""
     is_outlier: bool
     """true if `probability` reaches the threshold, and `real` is at least 0.5. At a `sensitivity`, objects of a class that few
     training scenes show are never outliers, and objects of a single class never are; the warning

@@ -1,0 +1,94 @@
+"""Doubt about the objects of a scene: intruders and wrong detections.
+
+An intruder is a real object that does not belong to the scene. The log-odds of an intruder of class
+i in a list of n classes are
+
+    l_i = intercept + slope·s_i + log_count·log n,   s_i = z_i - alpha·popularity_i
+
+z_i are the log-odds of the class given the rest of the scene (`Posterior.given_rest`). The prior of
+an intruder, alpha·popularity, is `SceneModel.intruder_prior`.
+
+A detection is real if object and label are right. Its log-odds (`RealFit`) rise with its confidence
+and with s_i. A detection of confidence 1 is real.
+
+A probable intruder and a probably wrong detection say little about the scene. So other answers
+weight the presence of an object of class i by real · (1 - sigmoid(l_i)) (`believed`).
+
+The doubt about classes that are not judged, and about a single class, is that of the detector
+alone: s_i counts as 0.
+
+Source of contextual re-scoring: Hoiem, Efros and Hebert, "Putting objects in perspective" (2008).
+"""
+
+import math
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from app.inference.elementary import sigmoid
+from app.model.calibration import CountSlope, RealFit
+from app.model.scene_model import SceneModel
+from app.questions.posterior import Posterior, calibrated
+from app.scene.scene import Scene, pool_classes
+
+LEAST_REAL: Final = 0.5
+"""Least probability of a right detection at which an object may raise an alarm."""
+
+Floats = NDArray[np.floating[Any]]
+
+
+class Doubt(NamedTuple):
+    """The doubt about the n classes and the N objects of a scene."""
+
+    logits: Float[Floats, "n"]  # of an intruder; -inf if the class is not judged
+    p: Float[Floats, "n"]  # probability of an intruder; 0 if the class is not judged
+    real: Float[Floats, "N"]  # probability that each object is a right detection
+    presence: Float[Floats, "n"]  # of each class, weighted by doubt
+
+
+def doubt(model: SceneModel, posterior: Posterior, log_odds: Float[Floats, "n"]) -> Doubt:
+    """Return the doubt about a scene, from the log-odds of each class given the rest."""
+    present, entry, n = posterior.present, model.calibration.outlier, posterior.listed
+    score = log_odds - model.intruder_prior[present.classes]
+    is_judged = model.vocabulary.judged[present.classes]
+    if entry is None:
+        is_judged = np.zeros_like(is_judged)
+        entry = CountSlope()
+    logits = np.where(is_judged, calibrated(entry, score, max(1, n)), -np.inf)
+    p = sigmoid(logits) * is_judged
+    presence: Float[Floats, "n"] = present.presence
+    real: Float[Floats, "N"] = present.confidence
+    if model.calibration.real is not None and (real < 1.0).any():
+        of_context = score * is_judged if n > 1 else np.zeros_like(score)
+        real = _real(model.calibration.real, real, of_context[present.row], n)
+        presence = pool_classes(present.classes[present.row], real)[4].astype(np.float32)
+    if n > 1:
+        presence = presence * (1.0 - p).astype(np.float32)
+    return Doubt(logits, p, real, presence)
+
+
+def _real(
+    fit: RealFit, confidence: Float[Floats, "N"], score: Float[Floats, "N"], n: int
+) -> Float[Floats, "N"]:
+    """Return the probability that each object is a right detection; n classes are listed."""
+    unsure = confidence < 1.0
+    c, real = confidence[unsure], confidence.copy()
+    logits = fit.intercept + fit.confidence * np.log(c / (1.0 - c)) + fit.context * score[unsure]
+    real[unsure] = sigmoid(logits + fit.log_count * math.log(max(1, n)))
+    return real
+
+
+def believed(model: SceneModel, scene: Scene) -> Posterior:
+    """Return the posterior given a scene, with the presence of each class weighted by doubt.
+
+    Raises:
+        ValueError: the machine does not know the class of an object, the room type or the profile.
+    """
+    posterior = Posterior(model, scene)
+    if not scene.objects:
+        return posterior
+    about = doubt(model, posterior, posterior.given_rest()[0])
+    posterior.weight(about.presence)
+    return posterior
