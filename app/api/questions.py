@@ -23,6 +23,7 @@ from app.questions.answer import Fields, envelope, written_within
 from app.questions.generate import STEPS
 from app.questions.names import LookUps, new_labels
 from app.questions.reading import Limits, Reading, read_scene
+from app.questions.several_rooms import several_rooms
 from app.registry import Artifact
 from app.scene.vocabulary import Vocabulary
 from app.serving.admission import Admission, Ticket, in_thread
@@ -131,6 +132,8 @@ def _read(
     options = question.read(scene, model, reading)
     words = list(reading.unknown.words.values())
     enlarged = model.with_words(words) if words else model
+    if not question.samples:
+        reading.warnings += several_rooms(enlarged, reading.scene)
     return reading, partial(question.answer, enlarged, reading.scene, **options)
 
 

@@ -224,6 +224,7 @@ class Calibration(Frozen):
     outlier_lines: AlarmLines | None = None  # by n; None exactly if `outlier` is None
     room_lines: AlarmLines | None = None  # with a stated room type; None: as `outlier_lines`
     rooms: Sharpness = Sharpness()
+    several_rooms: float | None = None  # least gain of a warning (`app.questions.several_rooms`)
     rare_rooms: Many[Count] = ()  # room types with too few training scenes for `/generate`
     written_rooms: Many[Count] = ()  # room types that written scenes alone show
     # (C + 1,) minimum number of classes in a generated scene of each room type, then of none.

@@ -28,6 +28,9 @@ _MOST_KEPT: Final = 4  # models with words that a model keeps, of about 20 MB ea
 RARELY: Final = 1 / 500
 """A class is rarely shown if a smaller share of the training scenes shows it."""
 
+ROOM_SHARPNESS: Final = 1.5
+"""Factor of the evidence of single classes for room types, which training keeps too small."""
+
 _LEAST_SCENES: Final = 20  # minimum number of scenes of a pair that shows the height of a seat
 _HIGHEST_SEAT: Final = 0.8  # maximum height of a seat, as a share of the height of the furniture
 # Maximum median spread of the heights of things, as a share of the height of the furniture. Things
@@ -108,6 +111,28 @@ class SceneModel:
         return np.where(np.isnan(popularity), alone - (1 - alpha) * rarest, alpha * popularity)
 
     @cached_property
+    def room_evidence(self) -> Float[NDArray[np.float32], "V C"]:
+        """Evidence of each class for each room type: `ROOM_SHARPNESS` (log p(t | i) - log p(t)).
+
+        p(t | i) is the probability of room type t given a scene of class i alone.
+        """
+        V, nothing = self.spec.V, np.zeros(0, np.int64)
+        c1, W, objects = self.weights["c1"], self.weights["W"], self.objects
+        empty = objects.room_log_p(c1[None], nothing, np.zeros((1, 0), np.float32), None)
+        one = np.ones((1, 1), np.float32)
+        alone = [
+            objects.room_log_p((c1 + W[i])[None], np.array([i]), one, None)[0] for i in range(V)
+        ]
+        evidence = ROOM_SHARPNESS * (np.stack(alone) - empty)
+        evidence[self.vocabulary.structure] = 0.0
+        return evidence.astype(np.float32)
+
+    @cached_property
+    def room_odds(self) -> Float[NDArray[np.float32], "V C"]:
+        """The exponential of `room_evidence`."""
+        return np.exp(self.room_evidence)
+
+    @cached_property
     def rarely_shown(self) -> Bool[NDArray[np.bool_], "V"]:
         """True for classes that fewer than `RARELY` of the training scenes show."""
         if not self.calibration.popularity:
@@ -171,6 +196,8 @@ class SceneModel:
             )
             # A reference to this model would close a cycle; see `app.serving.runtime`.
             stand_in = kept.vocabulary.stand_in
+            vars(kept)["room_evidence"] = self.room_evidence
+            vars(kept)["room_odds"] = self.room_odds
             vars(kept)["relation_units"] = StandIns(kept.weights, self.relation_units, stand_in)
             if len(self._with_words) >= _MOST_KEPT:
                 self._with_words.clear()  # in one step, because other threads read it

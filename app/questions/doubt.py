@@ -24,13 +24,14 @@ import math
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
+from app.compiling import compiled
 from app.inference.elementary import sigmoid
-from app.model.calibration import CountSlope, RealFit
+from app.model.calibration import RealFit
 from app.model.scene_model import SceneModel
-from app.questions.posterior import Posterior, calibrated
+from app.questions.posterior import Posterior
 from app.scene.scene import Scene, pool_classes
 
 LEAST_REAL: Final = 0.5
@@ -51,22 +52,54 @@ class Doubt(NamedTuple):
 def doubt(model: SceneModel, posterior: Posterior, log_odds: Float[Floats, "n"]) -> Doubt:
     """Return the doubt about a scene, from the log-odds of each class given the rest."""
     present, entry, n = posterior.present, model.calibration.outlier, posterior.listed
-    score = log_odds - model.intruder_prior[present.classes]
-    is_judged = model.vocabulary.judged[present.classes]
-    if entry is None:
-        is_judged = np.zeros_like(is_judged)
-        entry = CountSlope()
-    logits = np.where(is_judged, calibrated(entry, score, max(1, n)), -np.inf)
-    p = sigmoid(logits) * is_judged
-    presence: Float[Floats, "n"] = present.presence
+    line = (0.0, 0.0, 0.0) if entry is None else (entry.intercept, entry.slope, entry.log_count)
+    score, logits, p, presence = _intruders(
+        log_odds,
+        present.classes,
+        present.presence,
+        model.intruder_prior,
+        model.vocabulary.judged,
+        line,
+        n,
+        entry is not None,
+    )
     real: Float[Floats, "N"] = present.confidence
-    if model.calibration.real is not None and (real < 1.0).any():
-        of_context = score * is_judged if n > 1 else np.zeros_like(score)
-        real = _real(model.calibration.real, real, of_context[present.row], n)
-        presence = pool_classes(present.classes[present.row], real)[4].astype(np.float32)
-    if n > 1:
-        presence = presence * (1.0 - p).astype(np.float32)
+    if model.calibration.real is not None and real.min() < 1.0:
+        real = _real(model.calibration.real, real, score[present.row], n)
+        presence *= pool_classes(present.classes[present.row], real)[4] / present.presence
     return Doubt(logits, p, real, presence)
+
+
+@compiled
+def _intruders(
+    log_odds: Float[NDArray, " n"],
+    classes: Int[NDArray, " n"],
+    presence: Float[NDArray, " n"],
+    prior: Float[NDArray, " V"],
+    judged: Bool[NDArray, " V"],
+    line: tuple[float, float, float],  # intercept, slope and log_count of the log-odds
+    listed: int,
+    has_line: bool,  # whether the model judges objects
+) -> tuple[
+    Float[NDArray, " n"], Float[NDArray, " n"], Float[NDArray, " n"], Float[NDArray, " n"]
+]:  # fmt: skip
+    """Return score, log-odds and probability of an intruder, and weighted presence of n classes."""
+    n, (intercept, slope, log_count) = len(classes), line
+    score, logits, p = np.zeros(n), np.full(n, -np.inf), np.zeros(n)
+    weighted = presence.copy()
+    intercept += log_count * math.log(max(listed, 1))
+    for i in range(n):
+        if not judged[classes[i]]:
+            continue
+        value = log_odds[i] - prior[classes[i]]
+        if listed > 1:
+            score[i] = value
+        if has_line:
+            logits[i] = intercept + slope * value
+            p[i] = 1.0 / (1.0 + math.exp(-max(logits[i], -80.0)))
+            if listed > 1:
+                weighted[i] *= np.float32(1.0 - p[i])
+    return score, logits, p, weighted
 
 
 def _real(

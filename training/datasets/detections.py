@@ -1,8 +1,8 @@
 """A model of detectors: detections of a scene that are missed, mislabelled or ghosts.
 
 Each object is missed with the probability `MISSED`. A seen object has the label of a similar class
-with the probability `SWAPPED`. A scene of n seen objects has n + 1 chances of a ghost, each with the
-probability `GHOSTS`. The confidence is drawn from a beta distribution:
+with the probability `SWAPPED`. A scene of n seen objects has n + 1 chances of a ghost, each with
+the probability `GHOSTS`. The confidence is drawn from a beta distribution:
 
     right label      Beta(9, 2)
     swapped label    Beta(5, 4)

@@ -2,6 +2,7 @@
 
 rooms          Sharpness of the probabilities of `/rooms`, by maximum likelihood on parts of
                validation scenes of each number of classes, and on whole scenes.
+several_rooms  Gain of several rooms over one that few scenes of any large source reach.
 rare_rooms     Room types of few training scenes (`rare_rooms`).
 written_rooms  Room types that only written sources show.
 smallest, room_fit
@@ -28,6 +29,7 @@ from app.model.calibration import NO_LIMIT
 from app.questions.doubt import believed
 from app.questions.generate import STEPS, room_fit
 from app.questions.posterior import Posterior
+from app.questions.several_rooms import LEAST_CLASSES, gain
 from app.scene import Scene
 from training.datasets.array_types import Table
 from training.datasets.batches import SceneTensors, subset
@@ -46,6 +48,7 @@ _SAMPLES = 64
 _LEAST = 0.05
 _PARTS = (0.3, 0.5, 0.75, 1.0)
 _ROOM_SCENES = 20
+_ONE_ROOM, _LARGE_SOURCE = 0.985, 50
 _LONG_SCENES = 100  # of a room type, for a limit of the fit that grows with the list
 
 
@@ -55,6 +58,7 @@ def calibrate_rooms(
     """Return the entries about room types, from validation and complete training scenes."""
     return {
         "rooms": fit_rooms(artifact, scenes),
+        "several_rooms": fit_several_rooms(artifact, scenes),
         "rare_rooms": rare_rooms(artifact, train),
         "written_rooms": written_rooms(train),
         **limits(artifact, train),
@@ -80,6 +84,27 @@ def fit_rooms(artifact: SceneModel, scenes: SceneTensors) -> Sharpness:
 
     slope, log_count = minimize(loss, [1.0, 0.0], method="Nelder-Mead").x.round(4).tolist()
     return Sharpness(slope=slope, log_count=log_count)
+
+
+def fit_several_rooms(artifact: SceneModel, scenes: SceneTensors) -> float | None:
+    """Return the least gain of a warning; None without room types or a source of many scenes.
+
+    `_ONE_ROOM` is the share of the scenes of each source of at least 50 scenes with a smaller gain.
+    """
+    if artifact.spec.C < 2:
+        return None
+    evidence, limits = artifact.room_evidence, list[float]()
+    for source in scenes.source.unique().tolist():
+        own = scenes.v[scenes.source == source].numpy() > 0
+        lists = [np.flatnonzero(row & ~artifact.vocabulary.structure) for row in own]
+        gains = [
+            gain(evidence, artifact.room_odds, listed, 0.0)[0]
+            for listed in lists
+            if len(listed) >= LEAST_CLASSES
+        ]
+        if len(gains) >= _LARGE_SOURCE:
+            limits.append(float(np.quantile(gains, _ONE_ROOM)))
+    return max(limits, default=None)
 
 
 def posterior_of(artifact: SceneModel, v: Float[Tensor, "V"], room: int | None = None) -> Posterior:

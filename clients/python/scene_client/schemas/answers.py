@@ -113,7 +113,8 @@ WarningCode = Literal[
 ]  # fmt: skip
 
 
-class RoomPart(Reply):
+@dataclass(slots=True)
+class RoomPart:
     """The objects of a scene that are probably in one room, named by id."""
 
     room_type: str
