@@ -5,8 +5,8 @@ else derives from `ERRORS`: the pages, the error responses in the OpenAPI docume
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar, Final, Literal
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Final, Literal, Self
 
 from starlette.exceptions import HTTPException
 
@@ -127,6 +127,10 @@ class RequestError(ServiceError):
         most = "at least " * (count >= MAX_ERRORS)
         counted = f"The request has {most}{count} error{'' if count == 1 else 's'}"
         super().__init__(detail or f"{counted}, listed in `errors`.{self._hint}", errors=errors)
+
+    def below(self, at: Location) -> Self:
+        """Return the error with ``at`` in front of the location of each of its errors."""
+        return type(self)([replace(one, location=(*at, *one.location)) for one in self.located])
 
     def locate(self, body: Any, at: Location = ()) -> None:
         """Convert the located errors to `errors` with JSON pointers. A second call has no effect.

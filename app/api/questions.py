@@ -6,7 +6,7 @@ The answer to a batch has one entry for each scene.
 from collections.abc import Callable, Mapping
 from functools import partial
 from time import monotonic
-from typing import Any, Final, TypeAlias, TypeVar
+from typing import Any, Final, TypeAlias, TypeVar, cast
 
 from fastapi import APIRouter
 from pydantic_core import to_json
@@ -16,22 +16,22 @@ from app.api.body import JSONRoute, validated
 from app.api.gateway import SUCCESS, Record
 from app.api.openapi import error_responses, operation_id
 from app.api.problems import from_exception
-from app.errors import AnswerTooLargeError, LocatedError, RequestError
+from app.errors import AnswerTooLargeError, LocatedError, Location, RequestError
 from app.questions import QUESTIONS, Question
 from app.questions.alternatives import label_probabilities
 from app.questions.answer import Fields, envelope, written_within
 from app.questions.generate import STEPS
-from app.questions.names import LookUps, new_labels
-from app.questions.reading import Limits, Reading, read_scene
+from app.questions.names import LookUps, Unknown, new_labels, objects_of
+from app.questions.reading import Limits, Reading, read_scene, together
 from app.questions.several_rooms import several_rooms
 from app.registry import Artifact
 from app.scene.vocabulary import Vocabulary
 from app.serving.admission import Admission, Ticket, in_thread
 from app.serving.models import ServedModels
 from app.serving.runtime import Runtime
-from scene_client.schemas import MAX_BATCH, BatchAnswer, BatchRequest, SceneRequest
+from scene_client.schemas import MAX_BATCH, BatchAnswer, BatchRequest, SceneRequest, WhereRequest
 
-RequestT = TypeVar("RequestT", bound=SceneRequest)
+RequestT = TypeVar("RequestT", bound=SceneRequest | WhereRequest)
 
 _FULL = "the batch has reached SCENE_MAX_ANSWER_BYTES. Send this scene in another request"
 
@@ -103,38 +103,54 @@ async def _answer(
         computed = await admission.in_worker(ticket, lambda _: compute(monotonic(), *read()))
     body, answer, waited, seconds = computed
     runtime.metrics.computed(
-        artifact.key, question.name, waited, seconds, len(scene.objects), answer
+        artifact.key, question.name, waited, seconds, len(objects_of(scene)), answer
     )
     return body
 
 
 def _read(
     question: Question[RequestT],
-    scene: RequestT,
+    request: RequestT,
     artifact: Artifact,
     limits: Limits,
     look_ups: LookUps,
 ) -> tuple[Reading, partial[Fields]]:
-    """Return the scene as the model reads it, and the call that computes the answer."""
+    """Return the scene as the model reads it, and the call that computes the answer.
+
+    Of the rooms of a home, only the notes are in the reading.
+    """
     model = artifact.model
-    reading = read_scene(
-        scene,
-        model.vocabulary,
-        limits,
-        look_ups,
-        roles=model.roles,
-        spread=model.spread,
-        stands=None if model.places is None else model.places.stands,
-        profiles=artifact.manifest.vocabulary.profiles,
-        decide=lambda words, *about: label_probabilities(model.with_words(words), *about),
-        may_be_empty=question.samples,
-    )
-    options = question.read(scene, model, reading)
-    words = list(reading.unknown.words.values())
+    unknown = Unknown(model.vocabulary, request.unknown_labels, look_ups)
+
+    def read(scene: SceneRequest, at: Location = ()) -> Reading:
+        """Read a scene, which is at a location of the request."""
+        try:
+            return read_scene(
+                scene,
+                model.vocabulary,
+                limits,
+                unknown,
+                roles=model.roles,
+                spread=model.spread,
+                stands=None if model.places is None else model.places.stands,
+                profiles=artifact.manifest.vocabulary.profiles,
+                decide=lambda words, *about: label_probabilities(model.with_words(words), *about),
+                may_be_empty=question.samples or bool(at),
+            )
+        except RequestError as error:
+            raise (error.below(at) if at else error) from None
+
+    if question.rooms_of is None:
+        reading = read(cast("SceneRequest", request))
+        options: dict[str, Any] = {"scene": reading.scene, **question.read(request, model, reading)}
+    else:
+        rooms = [read(room, ("rooms", k)) for k, room in enumerate(question.rooms_of(request))]
+        reading, options = together(rooms), question.read(request, model, rooms)
+    words = list(unknown.words.values())
     enlarged = model.with_words(words) if words else model
-    if not question.samples:
+    if question.rooms_of is None and not question.samples:
         reading.warnings += several_rooms(enlarged, reading.scene)
-    return reading, partial(question.answer, enlarged, reading.scene, **options)
+    return reading, partial(question.answer, enlarged, **options)
 
 
 def _too_large(question: Question[Any], most: int) -> AnswerTooLargeError:
@@ -157,9 +173,11 @@ Such a question takes about 2 ms.
 """
 
 
-def is_quick(scene: SceneRequest, vocabulary: Vocabulary) -> bool:
-    """Return whether the event loop may compute a question about a scene."""
-    return is_small(vars(scene)) and new_labels(scene, vocabulary) <= QUICK_LABELS
+def is_quick(request: SceneRequest | WhereRequest, vocabulary: Vocabulary) -> bool:
+    """Return whether the event loop may compute a question about a scene or a home."""
+    objects = objects_of(request)
+    is_little = len(objects) <= QUICK_OBJECTS and is_small(vars(request))
+    return is_little and new_labels(request, objects, vocabulary) <= QUICK_LABELS
 
 
 def is_small(scene: Mapping[str, Any]) -> bool:

@@ -17,6 +17,7 @@ from app.model.calibration import (
     RealFit,
     Sensitivity,
     Sharpness,
+    WhereFit,
 )
 from app.model.possibility import Possibility
 from app.model.scene_model import SceneModel
@@ -25,5 +26,5 @@ from app.model.statistics import Counts, Offsets, Places
 __all__ = [
     "AlarmLine", "AlarmLines", "Calibration", "CountSlope", "Counts", "CoverageFit", "FitLimit",
     "Judgement", "LabelFit", "Misplaced", "Offsets", "PlaceFit", "Places", "Possibility",
-    "RealFit", "SceneModel", "Sensitivity", "Sharpness",
+    "RealFit", "SceneModel", "Sensitivity", "Sharpness", "WhereFit",
 ]  # fmt: skip

@@ -96,6 +96,18 @@ class PlaceFit(Frozen):
     intercept: float = 0.0
 
 
+class WhereFit(Frozen):
+    """The rooms of a thing in `/where`, with the log-odds l_r of `/missing` for each room r.
+
+    p(room r | it is in one of the rooms) is the softmax of slope·l_r. The log-odds that it is in
+    one of them are intercept + here·log sum_r exp(l_r).
+    """
+
+    slope: Annotated[float, Field(ge=0)] = 1.0
+    here: Annotated[float, Field(ge=0)] = 1.0
+    intercept: float = 0.0
+
+
 PlaceFits = Annotated[Many[PlaceFit], Field(max_length=len(CANONICAL))]
 
 
@@ -243,6 +255,7 @@ class Calibration(Frozen):
     relation_given: PairSlopes
     placement: PairSlopes
     at: PlaceFits
+    where: WhereFit = WhereFit()
     misplaced: Misplaced = Misplaced()  # observed relations, and objects on the floor or a wall
 
     @model_validator(mode="after")

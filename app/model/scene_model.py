@@ -111,19 +111,23 @@ class SceneModel:
         return np.where(np.isnan(popularity), alone - (1 - alpha) * rarest, alpha * popularity)
 
     @cached_property
+    def room_prior(self) -> Float[NDArray[np.float64], "C"]:
+        """log p(t) of each room type t in a scene without objects."""
+        c1, nothing = self.weights["c1"], np.zeros(0, np.int64)
+        return self.objects.room_log_p(c1[None], nothing, np.zeros((1, 0), np.float32), None)[0]
+
+    @cached_property
     def room_evidence(self) -> Float[NDArray[np.float32], "V C"]:
         """Evidence of each class for each room type: `ROOM_SHARPNESS` (log p(t | i) - log p(t)).
 
         p(t | i) is the probability of room type t given a scene of class i alone.
         """
-        V, nothing = self.spec.V, np.zeros(0, np.int64)
+        V, one = self.spec.V, np.ones((1, 1), np.float32)
         c1, W, objects = self.weights["c1"], self.weights["W"], self.objects
-        empty = objects.room_log_p(c1[None], nothing, np.zeros((1, 0), np.float32), None)
-        one = np.ones((1, 1), np.float32)
         alone = [
             objects.room_log_p((c1 + W[i])[None], np.array([i]), one, None)[0] for i in range(V)
         ]
-        evidence = ROOM_SHARPNESS * (np.stack(alone) - empty)
+        evidence = ROOM_SHARPNESS * (np.stack(alone) - self.room_prior)
         evidence[self.vocabulary.structure] = 0.0
         return evidence.astype(np.float32)
 

@@ -1,4 +1,4 @@
-"""The five questions about a scene. The module of a question contains everything about it.
+"""Five questions about a scene and one about a home. A module contains everything about one.
 
     relations   Which spatial relations hold between the objects of the scene?
     missing     Which unlisted objects are probably in the scene, and where? `more` adds the listed
@@ -6,9 +6,10 @@
     outliers    Which objects do not belong to the scene, and which stated relations are wrong?
     rooms       Of which room type is the scene, or where is such an object?
     generate    Which other scenes contain these objects and relations?
+    where       In which room of a home is such a thing, and where in the room?
 
 The function of a question takes a published model and a scene. It returns the fields of the answer,
-as `scene_client.schemas` defines them. The first four questions compute expectations, in closed
+as `scene_client.schemas` defines them. All questions but `generate` compute expectations, in closed
 form or with fixed random numbers. So the same scene always gets the same answer. `generate` draws
 random scenes. In the examples of the functions, `model` is the default model of the shipped store:
 `store.load(*store.resolve("default")).model`. To add a question, add a module to this package and
@@ -23,10 +24,14 @@ from app.questions.outliers import OUTLIERS, misplaced, outliers
 from app.questions.question import Question
 from app.questions.relations import RELATIONS, relations
 from app.questions.rooms import ROOMS, rooms
+from app.questions.where import WHERE, where
 
-QUESTIONS: Final[tuple[Question[Any], ...]] = (RELATIONS, MISSING, OUTLIERS, ROOMS, GENERATE)
+QUESTIONS: Final[tuple[Question[Any], ...]] = (
+    *(RELATIONS, MISSING, OUTLIERS, ROOMS, GENERATE, WHERE),
+)
 """All questions, in the order of the documentation."""
 
 __all__ = [
     "QUESTIONS", "Question", "generate", "misplaced", "missing", "outliers", "relations", "rooms",
+    "where",
 ]  # fmt: skip

@@ -17,7 +17,7 @@ from app.compiling import compiled
 from app.questions.posterior import Present
 from app.questions.reading import Reading
 from app.scene.scene import Scene
-from scene_client.schemas import ModelReference, SceneRequest
+from scene_client.schemas import ModelReference, SceneRequest, WhereRequest
 
 Fields: TypeAlias = dict[str, Any]
 """Fields of an answer, or of a part of an answer."""
@@ -37,7 +37,7 @@ _ROUNDING: Final = 1e-6  # a smaller change of log-odds is a rounding error
 
 
 def envelope(
-    request: SceneRequest, request_id: str, model: ModelReference, reading: Reading
+    request: SceneRequest | WhereRequest, request_id: str, model: ModelReference, reading: Reading
 ) -> Fields:
     """Return the fields that all answers share. `scene_client.schemas.Answer` describes them."""
     fields: Fields = {"model": model, "request_id": request_id}

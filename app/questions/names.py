@@ -21,7 +21,14 @@ from app.scene.labels import label_key
 from app.scene.nearest import spelt_alike
 from app.scene.scene import SceneObject
 from app.scene.vocabulary import Vocabulary, Word
-from scene_client.schemas import Mapped, RoomsRequest, SceneRequest, UnknownLabels
+from scene_client.schemas import (
+    Detection,
+    Mapped,
+    RoomsRequest,
+    SceneRequest,
+    UnknownLabels,
+    WhereRequest,
+)
 from scene_client.validation import MAX_ERRORS, PLAIN
 
 MAX_SUGGESTED: Final = 32
@@ -43,23 +50,36 @@ _SEARCHES: Final[dict[UnknownLabels, tuple[str, ...]]] = {
 """Names of the methods of `Vocabulary` that search for a label, for each treatment."""
 
 
-def new_labels(request: SceneRequest, vocabulary: Vocabulary) -> int:
+def objects_of(request: SceneRequest | WhereRequest) -> list[str | Detection]:
+    """Return the objects of a request about a scene or a home."""
+    if isinstance(request, WhereRequest):
+        return [thing for room in request.rooms for thing in room.objects]
+    return request.objects
+
+
+def new_labels(
+    request: SceneRequest | WhereRequest,
+    objects: Sequence[str | Detection],
+    vocabulary: Vocabulary,
+) -> int:
     """Return how many labels of objects and candidates need a search, which takes up to 1 ms.
 
     A label that is read by its meaning counts each time, and as `MAX_SUGGESTED` labels, because the
     model then needs predicted weights.
     """
     searches = _SEARCHES[request.unknown_labels]
-    labels = [entry if isinstance(entry, str) else entry.label for entry in request.objects]
-    labels += [
-        other.label
-        for entry in request.objects
-        if not isinstance(entry, str)
-        for other in entry.alternatives
-    ]
-    new = sum(not vocabulary.remembers(label, searches) for label in labels)
+    new = 0
+    for entry in objects:
+        if isinstance(entry, str):
+            new += not vocabulary.remembers(entry, searches)
+            continue
+        new += not vocabulary.remembers(entry.label, searches)
+        for other in entry.alternatives:
+            new += not vocabulary.remembers(other.label, searches)
     is_room = isinstance(request, RoomsRequest)
     candidates: Sequence[str] = getattr(request, "candidates", None) or ()
+    if isinstance(request, WhereRequest):
+        candidates = [request.label]
     if is_room:
         searches = tuple(search for search in searches if search != "meaning")
     new += sum(not vocabulary.remembers(label, searches, is_room=is_room) for label in candidates)

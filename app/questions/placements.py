@@ -38,6 +38,7 @@ PLACES: Final = 3  # maximum number of placements in the answer for one class
 
 LEAST_SHARE: Final = 0.75  # least probability of a placement, as a share of the first placement
 LEAST_LIKELY: Final = 0.05  # least probability of a placement
+LEAST_OF_EVERY: Final = 0.01  # least probability of a placement of `every_placement`
 _SEEN_FROM_ANCHORS: Final = tuple(map(opposite, RELATIONS))
 
 
@@ -76,6 +77,7 @@ def placements(
     at: Place | None = None,  # the requested place, which comes first in each result
     *,
     has_viewer: bool = True,  # whether the viewing direction is known
+    every: bool = False,  # all places on, in and under objects: see `every_placement`
 ) -> list[list[Fields]]:
     """Return the likeliest relations of each candidate to the listed objects, likeliest first.
 
@@ -119,9 +121,17 @@ def placements(
         candidates_too_large, things_too_large = do_not_fit(sizes[candidates], of_things)
         forward[:, INSIDE][candidates_too_large] = NO_UNIT
         backward[:, INSIDE][things_too_large] = NO_UNIT
+    limits = PLACES, first, LEAST_SHARE, LEAST_LIKELY
+    if every:
+        limits = 2 * A * len(anchors), first, 0.0, LEAST_OF_EVERY
+        for a in range(A):
+            if a not in SUPPORTS:
+                forward[:, a] = NO_UNIT
+            if a != ON_TOP:
+                backward[:, a] = NO_UNIT
     slopes, log_counts = model.relation_slopes.placement, present.log_counts[anchors]
     rows, relations, outgoing, columns, p = _likeliest_places(
-        slopes, forward, backward, log_counts, PLACES, first, LEAST_SHARE, LEAST_LIKELY
+        slopes, forward, backward, log_counts, *limits
     )
     offsets: Iterator[Fields | None] = repeat(None)
     if model.offsets is not None and any(thing.position is not None for thing in things):
@@ -148,6 +158,37 @@ def placements(
             entry["offset"] = offset
         entries[row].append(entry)
     return entries
+
+
+def every_placement(
+    model: SceneModel,
+    posterior: Posterior,
+    scene: Scene,
+    candidate: int,
+    axes: Axes,
+    *,
+    has_viewer: bool = True,
+) -> list[Fields]:
+    """Return all places of an absent class on, in and under objects, likeliest first.
+
+    The places have at least the probability `LEAST_OF_EVERY`. Objects of one class share their
+    probability. Only the first of them has an offset.
+    """
+    present, found = posterior.present, list[Fields]()
+    names = {scene.objects[k].id: row for row, k in enumerate(present.first.tolist())}
+    (places,) = placements(
+        model, posterior, scene, np.array([candidate]), axes, has_viewer=has_viewer, every=True
+    )
+    for place in places:
+        row = names[place["object"]]
+        share = place["probability"] / int(present.counts[row])
+        found.append(place | {"probability": share})
+        others = np.flatnonzero(present.row == row).tolist()
+        for number in others if len(others) > 1 else ():
+            if (other := scene.objects[number]).id != place["object"]:
+                fields = {"relation": place["relation"], "object": other.id}
+                found.append(fields | {"probability": share})
+    return found
 
 
 def _smaller_anchors(

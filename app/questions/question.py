@@ -7,11 +7,10 @@ from typing import Any, Final, Generic, TypeAlias, TypeVar
 
 from app.model.scene_model import SceneModel
 from app.questions.answer import Fields
-from app.questions.reading import Reading
 from app.scene.scene import Scene
 from scene_client import schemas
 
-RequestT = TypeVar("RequestT", bound=schemas.SceneRequest)
+RequestT = TypeVar("RequestT", bound=schemas.SceneRequest | schemas.WhereRequest)
 
 Options: TypeAlias = dict[str, Any]
 """Keyword arguments of the function of a question."""
@@ -33,6 +32,8 @@ class Question(Generic[RequestT]):
     The name of the function ``answer`` is the name of the question. The function takes a model, a
     scene and keyword arguments. It returns the fields of the answer that are not common to all
     answers. ``read`` returns its keyword arguments for a request, or raises `RequestError`.
+    ``rooms_of`` returns the scenes of a request about a home. ``read`` then gets a list of
+    readings, and their scenes are keyword arguments.
 
     If the question ``samples`` scenes, the scene of a request may be empty, the request has a field
     ``count``, and ``answer`` has an argument ``stop``, a function that returns True after the end
@@ -40,7 +41,7 @@ class Question(Generic[RequestT]):
     """
 
     answer: Callable[..., Fields]
-    read: Callable[[RequestT, SceneModel, Reading], Options]
+    read: Callable[[RequestT, SceneModel, Any], Options]
     request: type[RequestT]
     response: type[schemas.Answer]
     examples: Mapping[str, Example]  # by name; the default model knows their labels
@@ -49,6 +50,7 @@ class Question(Generic[RequestT]):
     # Asks a model about scenes with all options that need kernels of their own.
     ask_all: Callable[[SceneModel, tuple[Scene, ...]], Iterable[Fields]] | None = None
     samples: bool = False
+    rooms_of: Callable[[RequestT], list[schemas.SceneRequest]] | None = None
 
     def __post_init__(self) -> None:
         self.name = self.answer.__name__

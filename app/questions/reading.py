@@ -81,11 +81,21 @@ class Reading:
         return Names(self.scene.objects, self.unknown, self.left_out)
 
 
+def together(rooms: Sequence[Reading]) -> Reading:
+    """Return a reading without objects, with the notes on all rooms of a home."""
+    first = rooms[0]
+    whole = Reading(replace(first.scene, objects=()), first.unknown, [], first.vocabulary)
+    for room in rooms:
+        whole.warnings += [one for one in room.warnings if one not in whole.warnings]
+        whole.resolved += room.resolved
+    return whole
+
+
 def read_scene(
     request: SceneRequest,
     vocabulary: Vocabulary,
     limits: Limits,
-    look_ups: LookUps | None = None,  # shared by all scenes of a batch
+    unknown: Unknown | None = None,  # shared by the rooms of a home
     *,
     roles: RoleCounts | None = None,  # see `derive_relations`
     spread: Float[NDArray[np.floating], "V"] | None = None,  # see `observe`
@@ -101,7 +111,8 @@ def read_scene(
     """
     errors = ErrorList()
     _check_fields(request, limits, errors)
-    unknown = Unknown(vocabulary, request.unknown_labels, look_ups or LookUps())
+    if unknown is None:
+        unknown = Unknown(vocabulary, request.unknown_labels, LookUps())
     ids, left_out = _ids(request.objects, errors), list[tuple[str, str]]()
     detections: dict[int, Detection] = {}
     guesses: dict[int, Guesses] = {}

@@ -35,8 +35,9 @@ def rooms(
     """Rank the room types by their probability, likeliest first.
 
     The relations and the room type of the scene are not used. The probabilities of the candidates
-    sum to 1. `scene_client.schemas.RoomsAnswer` defines the fields. If the model has no room types,
-    the list is empty, with a warning.
+    sum to 1. Candidates are the rooms of a home, so all are equally likely without objects: their
+    log-odds lose log p(t) of an empty scene. `scene_client.schemas.RoomsAnswer` defines the fields.
+    If the model has no room types, the list is empty, with a warning.
 
     Example:
         >>> scene = Scene(model.vocabulary.bare_objects(["bed", "nightstand"]))
@@ -49,7 +50,10 @@ def rooms(
         return {"warnings": [] if C else [_NO_ROOM_TYPES], "room_types": []}
     posterior = believed(model, replace(scene, room_type=None))
     sharpness = model.calibration.rooms.of(posterior.listed)
-    p = softmax(sharpness * posterior.room_log_p()[among])
+    log_p = posterior.room_log_p()
+    if candidates is not None:
+        log_p = log_p - model.room_prior
+    p = softmax(sharpness * log_p[among])
     first = np.argsort(-p, kind="stable")[:top_k]
     entries: list[Fields] = []
     for t, probability in zip(among[first].tolist(), significant(p[first]), strict=True):

@@ -69,6 +69,7 @@ class Source:
     of_one_view: bool = False
     # Numbers of instances are the judgements of a writer, so statistics of counts leave them out.
     written: bool = False
+    of_homes: bool = False  # a group has the rooms of one home
     # A scene lists nearly all things of a room. `/generate` is compared with such scenes.
     whole_rooms: bool = False
 

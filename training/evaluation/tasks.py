@@ -48,6 +48,7 @@ from training.evaluation.relation_tasks import (
 )
 from training.evaluation.setting import Model, Outcome, Setting
 from training.evaluation.statistics_tasks import COUNTS, OFFSETS, counts_task, offsets_task
+from training.evaluation.where_task import RIVALS, WHERE, where_task
 
 
 @dataclass(frozen=True)
@@ -127,6 +128,7 @@ TASKS: dict[str, Task] = {
         "missing object at a place", placed_task, "at_place", ("MRR",), ("MRR", "MRR, on-top")
     ),
     "Rooms": Task("room type", rooms_task, "rooms", card=_ROOMS, tables=_ROOMS_SHOWN),
+    "Where": Task("room of a thing", where_task, "scene_model", WHERE, (*WHERE, *RIVALS)),
     "T3 outliers": Task("intruder", outliers_task, "", _each(["hit@1", "flagged"], LAWS)),
     "T3 alarms": Task("alarms in untouched parts", alarms_task, "flags", card=_ALARMS),
     "T3b placement": Task(

@@ -53,6 +53,7 @@ from training.fit.calibrate_rooms import (
     of_sources,
     posterior_of,
 )
+from training.fit.calibrate_where import fit_where
 from training.fit.configuration import ObjectsConfig
 from training.fit.regression import (
     LEAST_SCENES,
@@ -99,7 +100,8 @@ def calibrate_objects(
     artifact = recalibrated(artifact, **fit_doubt(artifact, scenes.scenes, seed))
     # Other answers weight the listed objects by the doubt about them.
     entries = fit_missing(artifact, scenes, chosen) | calibrate_rooms(artifact, scenes, learnt)
-    return recalibrated(artifact, **entries).calibration
+    artifact = recalibrated(artifact, **entries)
+    return recalibrated(artifact, where=fit_where(artifact, validation.scenes, seed)).calibration
 
 
 def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:

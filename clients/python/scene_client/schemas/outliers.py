@@ -54,12 +54,12 @@ class Outlier(Reply):
     log_odds: Finite | None = None
     """absent for an object of probability 0, which is not judged"""
     real: Probability = 1.0
-    """a weak detection that does not fit is probably wrong. Absent if all objects have confidence 1,
-    which counts as certain"""
+    """absent if all objects have confidence 1, which counts as certain. A weak detection that does
+    not fit is probably wrong"""
     is_outlier: bool
-    """true if `probability` reaches the threshold, and `real` is at least 0.5. At a `sensitivity`, objects of a class that few
-    training scenes show are never outliers, and objects of a single class never are; the warning
-    `not-judged` names them"""
+    """true if `probability` reaches the threshold, and `real` is at least 0.5. At a `sensitivity`,
+    objects of a class that few training scenes show are never outliers, and objects of a single
+    class never are; the warning `not-judged` names them"""
     reason: Verdict | None = None
     """`does-not-belong` for an outlier; `misdetection` if `real` is below 0.5; else absent"""
     because: list[Because] = []

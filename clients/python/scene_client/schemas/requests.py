@@ -367,7 +367,7 @@ class SceneFields(TypedDict, total=False):
     unknown_labels: UnknownLabels
 
 
-RequestT = TypeVar("RequestT", bound=SceneRequest)
+RequestT = TypeVar("RequestT", bound=Request)
 
 
 def _as_it_came(value: Any, _validate: object) -> Any:

@@ -98,7 +98,7 @@ class Spot(Reply):
     relation: RelationName | None = None
     """relation of the thing to `object`"""
     object: str | None = None
-    """id of an object of the room. For a listed thing, it is the thing itself, without `relation`"""
+    """id of an object of the room; for a listed thing, that of the thing itself"""
     probability: Probability
     is_listed: bool = False
     """true if the request lists the thing itself"""

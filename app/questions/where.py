@@ -1,0 +1,364 @@
+"""The question `where`: in which room is such a thing, and where in the room?
+
+The answer assumes one such thing. l_r are the calibrated log-odds of `/missing` that room r has it,
+given the objects and the type of the room. Then
+
+    p(room r | it is in one of the rooms) = softmax_r(slope·l_r)
+    p(it is in one of the rooms) = sigmoid(intercept + here·log sum_r exp(l_r))
+
+with the coefficients of `WhereFit`. Within the room, it is on, in or under an object with the
+probabilities of the placements of `/missing`, divided by their sum if this is above 1. The rest of
+the room has the rest of the probability. Several objects of a class share it equally.
+
+A listed thing of the class, or of a kind of it, is the wanted thing with its confidence. The hidden
+places share the probability that no listed thing is it.
+
+A place that the robot has searched without success keeps the share 1 - `LOOK`·s of its probability,
+where s is the share of the place that the robot has seen. Then all probabilities are divided by
+their sum.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import compress
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from app.errors import InvalidRequestError, Location
+from app.inference.elementary import softmax
+from app.model.scene_model import SceneModel
+from app.questions.answer import Fields, named, rounded_number
+from app.questions.doubt import believed
+from app.questions.missing import VIEWER
+from app.questions.names import ErrorList, Unknown
+from app.questions.placements import every_placement
+from app.questions.posterior import Posterior, calibrated_missing
+from app.questions.question import Example, Options, Question
+from app.questions.reading import Reading
+from app.scene.scene import Scene
+from scene_client.frames import Axes, is_world_fixed, viewer_axes
+from scene_client.schemas import MAX_THINGS, HomeRoom, SceneRequest, WhereAnswer, WhereRequest
+
+LOOK: Final = 0.8
+"""Probability that a robot that sees the place of a thing detects the thing."""
+
+NOWHERE: Final = -1
+"""Index of the room of a thing that is in no room."""
+
+
+@dataclass(frozen=True, slots=True)
+class Room:
+    """A room of a home."""
+
+    name: str
+    scene: Scene  # its objects, and its type
+    coverage: float | None = None  # listed share of its classes; None: unknown
+
+
+class Search(NamedTuple):
+    """A search without success."""
+
+    room: int  # index of the room
+    thing: str | None  # id of the object at which the robot has looked; None: the whole room
+    seen: float  # share of the place that the robot has seen
+
+
+class Spot(NamedTuple):
+    """A place, and its weight or probability."""
+
+    room: int  # index of the room, or `NOWHERE`
+    weight: float
+    fields: Fields  # `relation`, `object`, `is_listed` and `offset` of `scene_client.schemas.Spot`
+
+
+def where(
+    model: SceneModel,
+    rooms: Sequence[Room],
+    wanted: int,  # class of the thing
+    *,
+    word: str | None = None,  # the request's word for the class
+    searched: Sequence[Search] = (),
+    top_k: int = 20,
+    axes: Axes = VIEWER,  # see `viewer_axes`
+    has_viewer: bool = True,  # whether the viewing direction is known
+) -> Fields:
+    """Rank the places of one thing, likeliest first.
+
+    Returns:
+        The fields of `scene_client.schemas.WhereAnswer`.
+
+    Example:
+        >>> labels = {"kitchen": ["fridge", "stove"], "bathroom": ["toilet", "bathtub"]}
+        >>> rooms = [
+        ...     Room(name, Scene(model.vocabulary.bare_objects(things)))
+        ...     for name, things in labels.items()
+        ... ]
+        >>> where(model, rooms, model.vocabulary.index("toothbrush"))["rooms"][0]["room"]
+        'bathroom'
+    """
+    spots = [
+        spot._replace(weight=spot.weight * _missed(searched, spot))
+        for spot in _spots(model, rooms, wanted, axes, has_viewer=has_viewer)
+    ]
+    total = sum(spot.weight for spot in spots)
+    share = np.zeros(len(rooms) + 1)  # of each room; the last one is `NOWHERE`
+    for spot in spots:
+        share[spot.room] += spot.weight / total
+    places = sorted((spot for spot in spots if spot.room != NOWHERE), key=lambda spot: -spot.weight)
+    order = np.argsort(-share[:-1], kind="stable").tolist()
+    return named(model.vocabulary.labels[wanted], word) | {
+        "places": [
+            {
+                "room": rooms[spot.room].name,
+                "probability": rounded_number(spot.weight / total),
+                **spot.fields,
+            }
+            for spot in places[:top_k]
+        ],
+        "rooms": [
+            {"room": rooms[row].name, "probability": rounded_number(float(share[row]))}
+            for row in order
+        ],
+        "not_here": rounded_number(float(share[NOWHERE])),
+    }
+
+
+def _missed(searched: Sequence[Search], spot: Spot) -> float:
+    """Return the probability that all searches have missed a thing at a place."""
+    return math.prod(
+        1.0 - LOOK * search.seen
+        for search in searched
+        if search.room == spot.room and search.thing in (None, spot.fields.get("object"))
+    )
+
+
+def _spots(
+    model: SceneModel, rooms: Sequence[Room], wanted: int, axes: Axes, *, has_viewer: bool
+) -> Iterator[Spot]:
+    """Yield all places without searches, and that of no room. The weights have the sum 1."""
+    is_wanted = model.vocabulary.broader[:, wanted].copy()
+    is_wanted[wanted] = True
+    others, listed = list[Scene](), list[Spot]()
+    for row, room in enumerate(rooms):
+        scene = room.scene
+        wanted_ones = [is_wanted[thing.class_index or 0] for thing in scene.objects]
+        for thing in compress(scene.objects, wanted_ones):
+            itself: Fields = {"object": thing.id, "is_listed": True}
+            listed.append(Spot(row, thing.confidence, itself))
+        if any(wanted_ones):
+            kept = [not is_one for is_one in wanted_ones]
+            objects = tuple(compress(scene.objects, kept))
+            scene = replace(scene, objects=objects, relations=None)
+        others.append(scene)
+    hidden = math.prod(1.0 - spot.weight for spot in listed)
+    confidence = sum(spot.weight for spot in listed)
+    for spot in listed:
+        yield spot._replace(weight=(1.0 - hidden) * spot.weight / confidence)
+    posteriors = [believed(model, scene) for scene in others]
+    fit = model.calibration.where
+    log_odds = _log_odds(model, posteriors, rooms, wanted)
+    logit = fit.intercept + fit.here * float(np.logaddexp.reduce(log_odds))
+    here = hidden * (0.5 + 0.5 * math.tanh(logit / 2))  # tanh cannot overflow
+    yield Spot(NOWHERE, hidden - here, {})
+    shares = (here * softmax(fit.slope * log_odds)).tolist()
+    for row, (posterior, scene, share) in enumerate(zip(posteriors, others, shares, strict=True)):
+        left = 1.0
+        placed = every_placement(model, posterior, scene, wanted, axes, has_viewer=has_viewer)
+        scale = max(1.0, math.fsum(fields["probability"] for fields in placed))
+        for fields in placed:
+            p = fields.pop("probability") / scale
+            left -= p
+            yield Spot(row, share * p, fields)
+        yield Spot(row, share * max(left, 0.0), {})
+
+
+def room_log_odds(
+    model: SceneModel, rooms: Sequence[Room], wanted: int
+) -> Float[NDArray[np.float64], "rooms"]:
+    """Return the calibrated log-odds that each room has a thing that none of them lists."""
+    return _log_odds(model, [believed(model, room.scene) for room in rooms], rooms, wanted)
+
+
+def _log_odds(
+    model: SceneModel, posteriors: Sequence[Posterior], rooms: Sequence[Room], wanted: int
+) -> Float[NDArray[np.float64], "rooms"]:
+    calibration, rows = model.calibration, list[float]()
+    for posterior, room in zip(posteriors, rooms, strict=True):
+        coverage = calibration.coverage if room.coverage is None else room.coverage
+        raw = posterior.absent_log_odds(np.array([wanted]), coverage).astype(np.float64)
+        n = posterior.listed
+        rows += calibrated_missing(calibration, raw, n, room.coverage).tolist()
+    return np.array(rows)
+
+
+# ----------------------------------------------------------------------------------- the request
+
+
+def rooms_of(request: WhereRequest) -> list[SceneRequest]:
+    """Return each room of a request as a scene, without its type.
+
+    Raises:
+        InvalidRequestError: the rooms have too many objects, or two of them have the same id.
+    """
+    errors = ErrorList()
+    if sum(len(room.objects) for room in request.rooms) > MAX_THINGS:
+        message = f"the rooms must have at most {MAX_THINGS} objects together"
+        errors.add(InvalidRequestError, ("rooms",), message)
+    used: set[str] = set()
+    for k, room in enumerate(request.rooms):
+        if room.id in used:
+            errors.add(InvalidRequestError, ("rooms", k, "id"), "another room has this id")
+        used.add(room.id)
+    errors.raise_any()
+    shared = {name: getattr(request, name) for name in _SHARED}
+    return [SceneRequest.model_construct(objects=room.objects, **shared) for room in request.rooms]
+
+
+def _read(request: WhereRequest, _: SceneModel, readings: Sequence[Reading]) -> Options:
+    """Return the keyword arguments of `where` for a request. All rooms share `Reading.unknown`."""
+    errors, unknown, rooms = ErrorList(), readings[0].unknown, list[Room]()
+    wanted = unknown.resolve(request.label, request.label, ("label",), errors)
+    if wanted is None and not errors.by_class:
+        unknown.refuse(request.label, ("label",), errors, is_room=False)
+    for k, (room, reading) in enumerate(zip(request.rooms, readings, strict=True)):
+        room_type = _room_type(room, ("rooms", k, "room_type"), unknown, errors)
+        rooms.append(Room(room.id, replace(reading.scene, room_type=room_type), room.coverage))
+    searched = _searched(request, readings, errors)
+    errors.raise_any()
+    view = request.viewpoint
+    return {
+        "rooms": rooms,
+        "wanted": wanted,
+        "word": request.label,
+        "searched": searched,
+        "top_k": request.top_k,
+        "axes": viewer_axes(request.frame_id, None if view is None else view.yaw, request.up),
+        "has_viewer": view is not None or not is_world_fixed(request.frame_id),
+    }
+
+
+def _room_type(room: HomeRoom, at: Location, unknown: Unknown, errors: ErrorList) -> int | None:
+    """Return the room type that a room states, or else the one that its id names, if any."""
+    if room.room_type is not None:
+        return unknown.resolve(room.room_type, room.room_type, at, errors, is_room=True)
+    match = unknown.vocabulary.read(room.id, is_room=True)
+    return None if match is None else match.entry
+
+
+def _searched(
+    request: WhereRequest, readings: Sequence[Reading], errors: ErrorList
+) -> list[Search]:
+    """Return the searches of a request, without those at ignored objects."""
+    row_of = {room.id: row for row, room in enumerate(request.rooms)}
+    searches: list[Search] = []
+    for k, one in enumerate(request.searched):
+        row = row_of.get(one.room)
+        if row is None:
+            message = "no entry of `rooms` has this id"
+            errors.add(InvalidRequestError, ("searched", k, "room"), message)
+            continue
+        name, names = one.object, readings[row].names
+        if name is not None and not names.is_ignored(name):
+            index = names.find(name, ("searched", k, "object"), errors)
+            name = None if index is None else readings[row].scene.objects[index].id
+        elif name is not None:
+            continue
+        searches.append(Search(row, name, one.seen_share))
+    return searches
+
+
+_SHARED: Final = (
+    *("frame_id", "up", "units", "extents", "box_origin", "quaternion_order", "viewpoint"),
+    *("model", "profile", "unknown_labels"),
+)
+"""Fields of a request that its scenes share."""
+
+_HOME: Final[dict[str, Any]] = {
+    "label": "toothbrush",
+    "rooms": [
+        {"id": "kitchen", "objects": ["fridge", "stove", "counter"]},
+        {"id": "bathroom", "objects": ["toilet", "bathtub", {"id": "sink_1", "label": "sink"}]},
+        {"id": "bedroom", "objects": ["bed", "nightstand", "wardrobe"]},
+    ],
+}
+_EXAMPLES: Final = {
+    "home": Example("three rooms with the objects that the robot has seen", _HOME),
+    "searched": Example(
+        "the robot has looked at the sink and in half of the kitchen",
+        {
+            **_HOME,
+            "searched": [
+                {"room": "bathroom", "object": "sink_1"},
+                {"room": "kitchen", "seen_share": 0.5},
+            ],
+        },
+    ),
+    "types": Example(
+        "rooms by type, without objects",
+        {
+            "label": "pillow",
+            "rooms": [
+                {"id": "room_1", "room_type": "bedroom"},
+                {"id": "room_2", "room_type": "kitchen"},
+            ],
+        },
+    ),
+    "listed": Example("the robot has seen such a thing", {**_HOME, "label": "wardrobe"}),
+    "unknown-labels": Example(
+        "a thing that the model does not know", {**_HOME, "label": "tothbrush"}, "unknown-labels"
+    ),
+    "invalid-request": Example(
+        "a searched room that is not in the home",
+        {**_HOME, "searched": [{"room": "attic"}]},
+        "invalid-request",
+    ),
+    "model-not-found": Example(
+        "a model that does not exist", {**_HOME, "model": "nobody@9.9.9"}, "model-not-found"
+    ),
+}
+_EXAMPLE_ANSWER: Final = {
+    "label": "toothbrush",
+    "places": [
+        {"room": "bathroom", "probability": 0.41},
+        {"room": "bathroom", "probability": 0.38, "relation": "on-top", "object": "sink_1"},
+    ],
+    "rooms": [
+        {"room": "bathroom", "probability": 0.79},
+        {"room": "bedroom", "probability": 0.04},
+        {"room": "kitchen", "probability": 0.02},
+    ],
+    "not_here": 0.15,
+}
+
+_TEXT: Final = """
+Rank the places of one thing in a home, most probable first.
+
+A place is on, in or under an object, or the rest of a room. The probabilities of all places and of
+`not_here` sum to one. The answer assumes one such thing. Places that the robot has searched without
+success keep a fifth of their probability.
+"""
+
+
+def _ask_all(model: SceneModel, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
+    """Yield answers for the warm-up."""
+    rooms = [Room(str(k), scene) for k, scene in enumerate(scenes)]
+    structure = model.vocabulary.structure
+    yield where(model, rooms, int(structure.argmin()))
+    yield where(model, rooms, len(structure) - 1, searched=[Search(0, None, 0.5)])
+
+
+WHERE: Final = Question(
+    where,
+    _read,
+    WhereRequest,
+    WhereAnswer,
+    _EXAMPLES,
+    _EXAMPLE_ANSWER,
+    _TEXT,
+    _ask_all,
+    rooms_of=rooms_of,
+)
