@@ -18,7 +18,7 @@ from app.model.fields import Count, Frozen, Many, Sha256, TensorGroup, first_err
 from app.registry.description import Description
 from app.registry.errors import ArtifactError, Code
 
-FORMAT: Final = 11
+FORMAT: Final = 12
 MAX_TENSORS: Final = 10_000
 WEIGHTS: Final = "model.safetensors"
 CARD: Final = "card.md"
@@ -53,7 +53,7 @@ class FileEntry(Frozen):
 class Manifest(Description):
     """The description of a model, its stored tensors and the checksums of its other files."""
 
-    format: Literal[11] = FORMAT
+    format: Literal[12] = FORMAT
     tensors: Annotated[dict[str, TensorEntry], Field(max_length=MAX_TENSORS)]
     files: dict[str, FileEntry]
 
