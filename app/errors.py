@@ -26,6 +26,7 @@ Step = Literal[
     "models",  # routes that list or use the models
     "name",  # routes that find a model by its name
     "readiness",  # readiness checks
+    "recording",  # the route that writes confirmed scenes
     "route",  # all routes
     "scene",  # routes that answer a question about one scene
     "word",  # routes with a label in their path
@@ -255,6 +256,14 @@ class UnreadableFileError(RequestError, slug="unreadable-file", status=422, step
     docs/clients.md lists the formats. POST /scenes reads files with at most 32,768 lines, lists,
     objects, elements or attributes; the command `scene` reads larger files. Numeric class ids need
     the field `label_map`.
+    """
+
+
+class NotRecordedError(ServiceError, slug="not-recorded", status=503, steps=("recording",)):
+    """The service could not write the scene to its recording.
+
+    The file of SCENE_RECORDING cannot be written, or another program has locked it. The log of the
+    service states the reason. The scene is not recorded, so send it again.
     """
 
 

@@ -8,15 +8,15 @@ from fastapi import FastAPI
 from starlette.exceptions import HTTPException
 
 from app import __version__
-from app.api import health, models, openapi, pages, problems, questions, scenes, telemetry
+from app.api import confirm, health, models, openapi, pages, problems, questions, scenes, telemetry
 from app.api.gateway import gateway
 from app.serving.runtime import Runtime
 from app.settings import Settings
 
 _DESCRIPTION = """
-Ask a Boltzmann machine five questions about a scene: which relations hold between its objects,
-which objects are missing, which objects do not belong, which room it is, and what a similar scene
-looks like.
+Ask a Boltzmann machine about a scene: which relations hold between its objects, which objects are
+missing, which objects do not belong, which room it is, and what a similar scene looks like. Or ask
+where in a home a thing is.
 Positions are in metres, in the axes of `frame_id`. Objects are named by their ids, or by their
 labels if only one object has the label.
 Every failure is a problem document (RFC 9457). Its `type` identifies the problem type.
@@ -59,6 +59,8 @@ def create_app(settings: Settings) -> FastAPI:
 def _add_routes(app: FastAPI, settings: Settings) -> None:
     """Add all routes, and keep the set of their paths in `app.state.paths`."""
     app.router.routes += questions.router.routes + scenes.router.routes
+    if app.state.runtime.recorder is not None:
+        app.router.routes += confirm.router.routes
     routers = [models.router, health.router, *([health.monitoring] if settings.metrics else [])]
     for router in routers:
         app.include_router(router)

@@ -134,6 +134,9 @@ class Settings(BaseSettings):
     api_key: SecretStr | None = None
     """Key of all routes except health checks and pages, at least 16 characters; without a key,
     these routes are open."""
+    recording: Path | None = None
+    """File `*.jsonl` to which POST /confirm appends; without it or without a key, there is no such
+    route. For one replica."""
     cors_origins: _Words = ()
     """Web origins whose pages may use the service, separated by commas, such as
     `https://panel.example:8443`; none by default."""
@@ -148,7 +151,8 @@ class Settings(BaseSettings):
     max_body_bytes: Annotated[int, Field(ge=1024, le=64 * 2**20)] = 2 * 2**20
     """Maximum size of a request body in bytes."""
     max_scene_bytes: Annotated[int, Field(ge=1024, le=64 * 2**20)] = 256 * 2**10
-    """Maximum size in bytes of the body of a question about one scene."""
+    """Maximum size in bytes of the body of a question about one scene; a home may have twice as
+    much."""
     held_body_bytes: Annotated[int, Field(ge=2**20, le=2**36)] = 64 * 2**20
     """Maximum total size in bytes of the bodies of all requests and large answers in progress; one
     client holds at most a quarter."""
@@ -244,6 +248,16 @@ class Settings(BaseSettings):
     def _check_store(cls, value: Path) -> Path:
         if not value.is_dir():
             raise ValueError(f"SCENE_STORE must be an existing directory, but is {value}")
+        return value
+
+    @field_validator("recording")
+    @classmethod
+    def _check_recording(cls, value: Path | None) -> Path | None:
+        if value is not None and (value.suffix != ".jsonl" or not value.parent.is_dir()):
+            raise ValueError(
+                "SCENE_RECORDING must be a file *.jsonl in an existing directory, such as "
+                "/var/lib/scene/scenes.jsonl"
+            )
         return value
 
     @field_validator("max_request_timeout_ms")

@@ -299,12 +299,17 @@ class Size:
         self._app, self._bodies = app, bodies
         self._limit = settings.max_body_bytes
         self._limit_of_scene = min(settings.max_scene_bytes, self._limit)
+        self._limit_of_home = min(2 * settings.max_scene_bytes, self._limit)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on. The errors are those of `Bodies.read`."""
         client, body = scope["state"]["ticket"].client, b""
         if scope["method"] in _WITH_BODY:
-            limit = self._limit if scope["state"]["path"] in _LARGE else self._limit_of_scene
+            path, limit = scope["state"]["path"], self._limit_of_scene
+            if path in _LARGE:
+                limit = self._limit
+            elif path == "/where":
+                limit = self._limit_of_home
             length = next((v for name, v in scope["headers"] if name == b"content-length"), b"")
             body = await self._bodies.read(receive, client, limit, length)
         scope["state"]["body"] = body

@@ -25,9 +25,10 @@ _KEY_SCHEMES: Final = {
     "api-key-as-bearer-token": {"type": "http", "scheme": "bearer"},
 }
 TAGS: Final = [
-    {"name": "questions", "description": "The five questions about one scene."},
+    {"name": "questions", "description": "The questions about one scene, or about a home."},
     {"name": "batches", "description": "The same questions about many scenes in one request."},
     {"name": "files", "description": "Scenes from files of detectors, tools and simulators."},
+    {"name": "recording", "description": "Confirmed scenes, from which a home is learned."},
     {"name": "models", "description": "The models, their versions and their vocabularies."},
     {"name": "health", "description": "Health checks for orchestrators."},
     {"name": "monitoring", "description": "Metrics for Prometheus."},

@@ -121,36 +121,50 @@ def _read(
     """
     model = artifact.model
     unknown = Unknown(model.vocabulary, request.unknown_labels, look_ups)
-
-    def read(scene: SceneRequest, at: Location = ()) -> Reading:
-        """Read a scene, which is at a location of the request."""
-        try:
-            return read_scene(
-                scene,
-                model.vocabulary,
-                limits,
-                unknown,
-                roles=model.roles,
-                spread=model.spread,
-                stands=None if model.places is None else model.places.stands,
-                profiles=artifact.manifest.vocabulary.profiles,
-                decide=lambda words, *about: label_probabilities(model.with_words(words), *about),
-                may_be_empty=question.samples or bool(at),
-            )
-        except RequestError as error:
-            raise (error.below(at) if at else error) from None
-
+    read = partial(read_for, artifact=artifact, limits=limits, unknown=unknown)
     if question.rooms_of is None:
-        reading = read(cast("SceneRequest", request))
+        reading = read(cast("SceneRequest", request), may_be_empty=question.samples)
         options: dict[str, Any] = {"scene": reading.scene, **question.read(request, model, reading)}
     else:
-        rooms = [read(room, ("rooms", k)) for k, room in enumerate(question.rooms_of(request))]
+        rooms = [read(room, at=("rooms", k)) for k, room in enumerate(question.rooms_of(request))]
         reading, options = together(rooms), question.read(request, model, rooms)
     words = list(unknown.words.values())
     enlarged = model.with_words(words) if words else model
     if question.rooms_of is None and not question.samples:
         reading.warnings += several_rooms(enlarged, reading.scene)
     return reading, partial(question.answer, enlarged, **options)
+
+
+def read_for(
+    scene: SceneRequest,
+    artifact: Artifact,
+    limits: Limits,
+    unknown: Unknown,
+    at: Location = (),  # of the scene in the request
+    *,
+    may_be_empty: bool = False,
+) -> Reading:
+    """Read a scene for a model.
+
+    Raises:
+        RequestError: the scene is invalid.
+    """
+    model = artifact.model
+    try:
+        return read_scene(
+            scene,
+            model.vocabulary,
+            limits,
+            unknown,
+            roles=model.roles,
+            spread=model.spread,
+            stands=None if model.places is None else model.places.stands,
+            profiles=artifact.manifest.vocabulary.profiles,
+            decide=lambda words, *about: label_probabilities(model.with_words(words), *about),
+            may_be_empty=may_be_empty or bool(at),
+        )
+    except RequestError as error:
+        raise (error.below(at) if at else error) from None
 
 
 def _too_large(question: Question[Any], most: int) -> AnswerTooLargeError:

@@ -17,6 +17,7 @@ from app.serving.admission import Admission, Bodies
 from app.serving.metrics import Metrics, Outcome
 from app.serving.models import DEFAULT, NO_MODELS, ServedModels, warm_up
 from app.settings import Settings
+from scene_client.recorder import Recorder
 from scene_client.schemas import Failure
 
 _logger = logging.getLogger("app.serving")
@@ -40,6 +41,9 @@ class Runtime:
         self.limits = Limits(
             settings.max_objects, settings.max_relations, settings.max_answer_bytes
         )
+        self.recorder: Recorder | None = None  # of confirmed scenes; only with an API key
+        if settings.recording is not None and settings.api_key is not None:
+            self.recorder = Recorder(settings.recording)
         self._poll = settings.store_poll  # seconds between two checks of the store; 0: none
         self._requested = asyncio.Event()  # set to check the store at once
         self._following: asyncio.Task[None] | None = None

@@ -89,13 +89,16 @@ def time_of(request: SceneRequest) -> Time:
     return strftime("%Y-%m-%dT%H", localtime(second)), {"sec": second, "nanosec": nanosecond}
 
 
-def likely(request: SceneRequest) -> list[Thing]:
-    """Return the fields of the recorded objects. For a label, this is only the field `label`."""
+def likely(request: SceneRequest, least: float = LEAST_CONFIDENCE) -> list[Thing]:
+    """Return the fields of the objects of at least this confidence.
+
+    For a label, this is only the field `label`.
+    """
     # A dictionary is faster than the attributes of a pydantic object.
     things: Iterable[Thing] = (
         {"label": one} if isinstance(one, str) else vars(one) for one in request.objects
     )
-    return [one for one in things if one.get("confidence", 1.0) >= LEAST_CONFIDENCE]
+    return [one for one in things if one.get("confidence", 1.0) >= least]
 
 
 def _ids(things: Sequence[Thing]) -> list[str]:

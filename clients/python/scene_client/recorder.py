@@ -126,6 +126,21 @@ class Recorder:
             except RuntimeError:  # no thread can start, for example at the end of the program
                 self.flush()
 
+    def confirm(self, request: SceneRequest) -> str | None:
+        """Write a scene that a person has confirmed, also if it is not new, before the return.
+
+        Return its id in the file, or None if an error prevented the writing.
+        """
+        if self._process != os.getpid():
+            self._start()
+        self.flush()
+        scene = scene_of(request, things=likely(request, 0.0)) | {"confirmed": True}
+        scenes: _Scenes = deque([([], to_json(scene) + b"\n")])
+        with self._writing:
+            while scenes:
+                self._append(scenes)
+            return None if self._is_failing else str(scene["scene_id"])
+
     def flush(self) -> None:
         """Write the waiting scenes. The end of the program writes them too."""
         if self._process != os.getpid():

@@ -6,6 +6,7 @@ Each question has its own module. The modules `requests` and `answers` contain t
 from __future__ import annotations
 
 from scene_client.schemas.answers import *  # noqa: F403
+from scene_client.schemas.confirm import *  # noqa: F403
 from scene_client.schemas.generate import *  # noqa: F403
 from scene_client.schemas.missing import *  # noqa: F403
 from scene_client.schemas.models import *  # noqa: F403
