@@ -50,6 +50,8 @@ def scene_of(
         has_viewer = request.viewpoint is not None or not is_world_fixed(request.frame_id)
         scene["viewer_frame"] = has_viewer
     scene["stamp"] = stamp
+    if request.confirmed:
+        scene["confirmed"] = True
     return scene
 
 

@@ -126,6 +126,14 @@ class Recorder:
             except RuntimeError:  # no thread can start, for example at the end of the program
                 self.flush()
 
+    def confirm(self, request: SceneRequest) -> None:
+        """Write a scene that a person has confirmed, also if it is not new, before the return."""
+        if self._process != os.getpid():
+            self._start()
+        time, things = time_of(request), likely(request)
+        self._waiting.append(([], request, time, things))
+        self.flush()
+
     def flush(self) -> None:
         """Write the waiting scenes. The end of the program writes them too."""
         if self._process != os.getpid():
