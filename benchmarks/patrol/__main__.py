@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_args
 
 import typer
 
@@ -72,8 +72,10 @@ def _setting(text: str) -> tuple[str, float | int | str]:
 
 
 def _situation(name: str) -> Situation:
-    if name == "full" or name == "poses" or name == "labels":
-        return name
+    for one in get_args(Situation):
+        if one == name:
+            found: Situation = one
+            return found
     raise typer.BadParameter("the situation must be full, poses or labels")
 
 

@@ -92,7 +92,8 @@ def drive(
         )
         for name, one in zip(home.matched, seen, strict=True):
             true[name][one.true] += 1
-        alarms, labels = set(), {}
+        alarms: set[tuple[str, str]] = set()
+        labels: dict[str, str] = {}
         for alarm in home.alarms:
             if alarm.room != names[room]:
                 continue

@@ -51,6 +51,11 @@ FIRST_PAUSE, LONGEST_PAUSE = 2.0, 30.0
 NOTABLE: Final = 0.2
 """Share of the votes from which the second label is an alternative."""
 MOST_OBJECTS: Final = 256
+UNKNOWN: Final = "nearest-or-ignore"
+MARGIN: Final = 0.3
+"""Difference of probabilities from which another type of a room is likelier."""
+LIKELY: Final = 0.2
+"""Probability of existence from which a thing is evidence for the type of its room."""
 LOOKS: Final = 8
 """Number of headings after which the robot has looked around in a room."""
 LABEL_LOOKS: Final = 30
@@ -261,15 +266,18 @@ class Home:
     # ------------------------------------------------------------------------------- questions
 
     def _ask(self) -> Iterator[Event]:
-        """Ask about the room of the robot if its things have changed."""
+        """Ask about the room of the robot if its things have changed, or its type is open."""
         if self._now < self._next:
             return
-        things, asked = self._things(self.room), self._asked.get(self.room, {})
-        if not things or (self._lost is None and not self._has_changed(things, asked)):
-            return
+        things, state = self._things(self.room), self._rooms[self.room]
+        is_new = self._lost is not None or self._has_changed(things)
+        is_open = state.is_named is not True and (is_new or state.type.value is None)
         timeout = self.settings.timeout if self._lost is None else LOST_TIMEOUT
         try:
-            self._judge(things, timeout)
+            if is_open and (likely := self._things(self.room, LIKELY)):
+                self._ask_type(likely, state, timeout)
+            if is_new and things:
+                self._ask_outliers(things, state, timeout)
         except InvalidRequestError:
             raise
         except ClientError as error:
@@ -278,12 +286,13 @@ class Home:
             pause = FIRST_PAUSE if self._lost is None else min(LONGEST_PAUSE, 2 * self._lost)
             self._lost, self._next = pause, self._now + pause
             return
-        if self._lost is not None:
+        if self._lost is not None and things:
             yield Event("service", self._now, self._now, label="back")
-        self._lost, self._next = None, self._now + self.settings.pause
+            self._lost = None
+        self._next = self._now + self.settings.pause
 
-    def _has_changed(self, things: list[Track], asked: dict[str, Any]) -> bool:
-        step = self.settings.step
+    def _has_changed(self, things: list[Track]) -> bool:
+        step, asked = self.settings.step, self._asked.get(self.room, {})
         if asked.keys() != {one.id for one in things}:
             return True
         for one in things:
@@ -294,22 +303,27 @@ class Home:
                 return True
         return False
 
-    def _judge(self, things: list[Track], timeout: float) -> None:
-        """Ask for the outliers, and for the type of the room unless its name is a room type."""
-        scene, state = self.scene(self.room), self._rooms[self.room]
+    def _ask_type(self, things: list[Track], state: RoomState, timeout: float) -> None:
+        scene = self._scene(things, None)
+        options = {"candidates": self._candidates} if self._candidates else {}
+        answer = self.client.rooms(
+            scene["objects"], unknown_labels=UNKNOWN, detail="scores", timeout=timeout, **options
+        )
+        types = {one.room_type: one.probability for one in answer.room_types}
+        if types:
+            best = max(types, key=types.__getitem__)
+            if types[best] - types.get(state.best or "", 0.0) > MARGIN:
+                state.best = best
+            state.probability = types.get(state.best or "", 0.0)
+
+    def _ask_outliers(self, things: list[Track], state: RoomState, timeout: float) -> None:
+        scene = self._scene(things, self.room)
         answer = self.client.outliers(
             **scene, sensitivity=self.settings.sensitivity, timeout=timeout
         )
         if "room_type" in scene and state.is_named is None:
             guessed = [one.label for one in answer.mapped if one.similarity < 1]
             state.is_named = self.room not in (*answer.ignored, *guessed)
-        if state.is_named is not True:
-            common = {"objects": scene["objects"], "unknown_labels": scene["unknown_labels"]}
-            if self._candidates:
-                common["candidates"] = self._candidates
-            types = self.client.rooms(**common, detail="scores", timeout=timeout).room_types
-            if types:
-                state.best, state.probability = types[0].room_type, types[0].probability
         self._asked[self.room] = {one.id: (one.label, _confidence(one), one.place) for one in things}
         misplaced = {
             one.moved or one.subject: one.probability for one in answer.misplaced if one.is_misplaced
@@ -327,11 +341,12 @@ class Home:
                 track.verdict, track.probability = "misdetection", 1 - outlier.real
 
     def _settle(self, elapsed: float) -> Iterator[Event]:
-        """Count the answer about the type of the robot's room."""
+        """Count the answer about the type of the robot's room. Doubtful answers count less."""
         state, s = self._rooms[self.room], self.settings
-        step = min(min(1.0, elapsed) / s.room_hold, 1 / s.answers)
+        sure = state.probability ** 2
+        step = sure * min(min(1.0, elapsed) / s.room_hold, 1 / s.answers)
         former = state.type.value
-        if state.best is not None and state.type.update(state.best, self._now, step):
+        if state.best and state.type.update(state.best, self._now, step):
             yield Event(
                 "room", self._now, state.type.since, label=state.best, room=self.room,
                 probability=state.probability, detail=former,
@@ -368,12 +383,16 @@ class Home:
         room = self.room if room is None else room
         return self._scene(self._things(room), room)
 
-    def _things(self, room: str | None) -> list[Track]:
-        """Return the most certain present things of a room. Without rooms, they are near."""
+    def _things(self, room: str | None, exists: float | None = None) -> list[Track]:
+        """Return the most certain things of a room, by default the present ones.
+
+        Without rooms, these are the things near the robot.
+        """
         found = [
             one
-            for one in self.things()
+            for one in self._tracks.all.values()
             if one.room == room
+            and (one.is_confirmed if exists is None else one.exists >= exists)
             and (room is not None or one.place is None or self._pose is None
                  or math.dist(one.place[:2], self._pose[:2]) <= NEAR)
         ]  # fmt: skip
@@ -383,7 +402,7 @@ class Home:
         shift = self._tracks.shift
         scene: dict[str, Any] = {
             "objects": [_object(one, shift) for one in things],
-            "unknown_labels": "nearest-or-ignore",
+            "unknown_labels": UNKNOWN,
         }
         if any("position" in one for one in scene["objects"]):
             scene["frame_id"] = "map"

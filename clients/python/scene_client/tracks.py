@@ -28,7 +28,7 @@ UNCONFIRMED: Final = 60.0
 """Seconds without a detection after which an unconfirmed track ends."""
 FARTHEST_SHIFT: Final = 2.5
 """Largest jump of the map in metres."""
-SIMILAR: Final = 1.6
+SIMILAR: Final = 1.3
 """Largest ratio of the diagonals of two boxes that may be one thing with two labels."""
 # Probability that a frame shows a thing of the room: known view, poses only, labels only.
 FULL, POSES, LABELS = 1.0, 0.6, 0.25
@@ -77,8 +77,8 @@ class Settings:
 class Latch:
     """A value that changes only after a while.
 
-    A different value must be ahead of the current one by steps that sum to 1. `since` is the time
-    of the first of these steps.
+    The steps for a candidate must be ahead of all other steps by 1 (majority vote of Boyer and
+    Moore). `since` is the time of the candidate's first step.
     """
 
     value: str | None = None
@@ -88,7 +88,7 @@ class Latch:
 
     def update(self, value: str | None, now: float, step: float) -> bool:
         """Count one step for a value. Return whether the latch changes to this value."""
-        if value == self.value:
+        if value == self.value or (value != self.candidate and self.level > step / 2):
             self.level = max(0.0, self.level - step)
             return False
         if value != self.candidate or self.level == 0:
@@ -96,7 +96,7 @@ class Latch:
         self.level += step
         if self.level < 1 - 1e-9:
             return False
-        self.value, self.level = value, 0.0
+        self.value, self.candidate, self.level = value, None, 0.0
         return True
 
 
@@ -358,7 +358,8 @@ class Tracks:
                 if distance > gate:
                     continue
                 like = track.likeness(seen)
-                if like > 0 or _are_similar(seen.size, track.size):
+                is_swap = distance < self.settings.gate and _are_similar(seen.size, track.size)
+                if like > 0 or is_swap:
                     yield distance / gate + 1 - like, track
 
     def _gate(self, size: Vector | None) -> float:
