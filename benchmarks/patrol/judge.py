@@ -17,11 +17,15 @@ THINGS = ("out-of-place", "misplaced", "misdetection")
 
 @dataclass
 class Row:
-    """One second of a patrol. An alarm is a pair of the true thing, or a track, and its kind."""
+    """One second of a patrol. An alarm is a pair of the true thing, or a track, and its kind.
+
+    `is_known` is true from the first detection in the room on.
+    """
 
     lap: int
     room: str
     visible: set[str]
+    is_known: bool
     said: str | None
     alarms: set[tuple[str, str]]
     labels: dict[str, str]
@@ -37,6 +41,7 @@ class Counts:
     wrong: int = 0
     onsets: Counter[str] = field(default_factory=Counter)
     changes: int = 0
+    known: int = 0
     room_right: int = 0
     room_changes: int = 0
     found: list[int] = field(default_factory=list)
@@ -59,7 +64,7 @@ class Counts:
             "on/off/min": round(self.changes / minutes, 3),
             "found": "".join(map(str, self.found)),
             "s in view": (max(self.in_view, default=0), median(self.in_view or [0])),
-            "room right": round(self.room_right / max(1, self.seconds), 3),
+            "room right": round(self.room_right / max(1, self.known), 3),
             "room changes/min": round(self.room_changes / minutes, 3),
         }
 
@@ -81,7 +86,7 @@ def drive(
         settings=settings,
     )
     true: dict[str, Counter[str | None]] = defaultdict(Counter)
-    rows = []
+    rows, known = [], set()
     for second, (lap, room, pose, seen) in enumerate(world.frames):
         is_placed = situation != "labels"
         events = home.update(
@@ -102,7 +107,9 @@ def drive(
             alarms.add((key, alarm.kind))
             labels[key] = alarm.label or ""
         visible = {one.id for one in world.visible(room, pose)}
-        rows.append(Row(lap, room, visible, home.room_type(), alarms, labels, events))
+        known |= {room} if seen else set()
+        row = Row(lap, room, visible, room in known, home.room_type(), alarms, labels, events)
+        rows.append(row)
     return rows
 
 
@@ -143,10 +150,12 @@ def count(rows: Iterable[Row], world: World, sums: Counts) -> None:
                 sums.onsets["place" if kind == "misplaced" else group] += 1
                 sums.worst[f"{kind} {key.split('#')[0]} as {row.labels[key]} in {row.room}"] += 1
         before[row.room] = row.alarms
-        sums.room_right += row.said == world.types[row.room]
-        if last is not None and last.room == row.room:
-            sums.room_changes += last.said != row.said
-        last = row
+        if row.is_known:
+            sums.known += 1
+            sums.room_right += row.said == world.types[row.room]
+            if last is not None and last.room == row.room:
+                sums.room_changes += last.said != row.said
+            last = row
         sums.events.update(event.kind for event in row.events)
     sums.found.append(len(found))
     sums.in_view += found.values()

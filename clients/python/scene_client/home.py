@@ -52,7 +52,7 @@ NOTABLE: Final = 0.2
 """Share of the votes from which the second label is an alternative."""
 MOST_OBJECTS: Final = 256
 UNKNOWN: Final = "nearest-or-ignore"
-MARGIN: Final = 0.3
+MARGIN: Final = 0.1
 """Difference of probabilities from which another type of a room is likelier."""
 LIKELY: Final = 0.2
 """Probability of existence from which a thing is evidence for the type of its room."""
@@ -343,7 +343,7 @@ class Home:
     def _settle(self, elapsed: float) -> Iterator[Event]:
         """Count the answer about the type of the robot's room. Doubtful answers count less."""
         state, s = self._rooms[self.room], self.settings
-        sure = state.probability ** 2
+        sure = state.probability
         step = sure * min(min(1.0, elapsed) / s.room_hold, 1 / s.answers)
         former = state.type.value
         if state.best and state.type.update(state.best, self._now, step):

@@ -59,8 +59,8 @@ class Settings:
 
     hit_rate: float = 0.7
     false_rate: float = 0.02
-    prior: float = 0.05
-    confirm: float = 0.9
+    prior: float = 0.1
+    confirm: float = 0.8
     gate: float = 0.3
     look: float = 0.5
     hold: float = 3.0
