@@ -102,7 +102,7 @@ def drive(
         for alarm in home.alarms:
             if alarm.room != names[room]:
                 continue
-            (thing, hits), = true[alarm.id or ""].most_common(1)
+            ((thing, hits),) = true[alarm.id or ""].most_common(1)
             key = thing if thing is not None and hits else f"ghost {alarm.id}"
             alarms.add((key, alarm.kind))
             labels[key] = alarm.label or ""

@@ -1,16 +1,17 @@
 """Tracks of things: which detections show one thing, whether the thing exists, and its label.
 
-docs/moving.md describes the tracks. Positions are in metres in the frame ``map``, angles in
-radians, and times in seconds.
+docs/moving.md describes the tracks. Lengths are in metres in the frame ``map``, angles in radians,
+and times in seconds.
 """
 
 from __future__ import annotations
 
 import math
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple
+from functools import cached_property
+from typing import Any, Final
 
 from scene_client import schemas
 from scene_client.calls import validated
@@ -18,59 +19,36 @@ from scene_client.calls import validated
 Vector = tuple[float, float, float]
 Point = tuple[float, float]
 
-CELL: Final = 1.0
-"""Width of a cell of the grid of tracks in metres, and the largest gate."""
-MOST_CERTAIN: Final = 8.0
-"""Upper limit of the log-odds of existence. After it, a gone thing needs at most 10 looks."""
-MEMORY: Final = 20.0
-"""Number of looks after which the mean of a position forgets older looks."""
-UNCONFIRMED: Final = 60.0
-"""Seconds without a detection after which an unconfirmed track ends."""
-FARTHEST_SHIFT: Final = 2.5
-"""Largest jump of the map in metres."""
-SIMILAR: Final = 1.3
-"""Largest ratio of the diagonals of two boxes that may be one thing with two labels."""
-# Probability that a frame shows a thing of the room: known view, poses only, labels only.
+CELL: Final = 1.0  # width of a cell of the grid of tracks, and the largest gate
+MOST_CERTAIN: Final = 8.0  # largest log-odds of existence; a gone thing needs about 10 looks
+MEMORY: Final = 20.0  # looks after which the mean of a position forgets older looks
+UNCONFIRMED: Final = 60.0  # seconds without a detection after which an unconfirmed track ends
+FARTHEST_JUMP: Final = 2.5  # of the map
+SIMILAR: Final = 1.3  # largest ratio of the diagonals of two boxes of one thing with two labels
+NOTABLE: Final = 0.2  # share of the votes from which another label is an alternative
+BESIDE: Final = math.radians(45)  # between a thing and its neighbours in a frame without a view
+# Probability that a frame shows a thing: in a known view, between others, in the same room.
 FULL, POSES, LABELS = 1.0, 0.6, 0.25
-_NEXT_TO: Final = math.radians(45)
 
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings of a `Home`. The defaults are measured (docs/moving.md).
+    """The settings of a `Home`. The defaults are those of the best patrols (docs/moving.md)."""
 
-    Attributes:
-        hit_rate: probability that the detector reports a thing that the frame shows.
-        false_rate: probability of a wrong detection at the place of an ended thing.
-        prior: probability that the first detection at a place shows a thing.
-        confirm: probability of existence from which a thing counts as present.
-        gate: distance in metres between two detections of one small thing. A quarter of its largest
-            side is added for a large thing.
-        look: seconds between two independent looks. Frames at a higher rate count in proportion.
-        hold: seconds in view until an alarm is raised or cleared.
-        answers: looks until an alarm is raised or cleared.
-        room_hold: seconds until the type of a room is settled or changes.
-        pause: seconds between two questions.
-        step: change of a probability, or of a position in metres, that needs a new answer.
-        sensitivity: alarm rate of the service: low, medium or high.
-        timeout: maximum time of a question in seconds.
-        save_every: seconds between two writes of the file.
-    """
-
-    hit_rate: float = 0.7
-    false_rate: float = 0.02
-    prior: float = 0.1
-    confirm: float = 0.8
-    gate: float = 0.3
-    look: float = 0.5
-    hold: float = 3.0
-    answers: int = 3
-    room_hold: float = 5.0
-    pause: float = 0.5
-    step: float = 0.1
-    sensitivity: schemas.Sensitivity = "medium"
-    timeout: float = 1.0
-    save_every: float = 10.0
+    hit_rate: float = 0.7  # probability that the detector reports a thing that the frame shows
+    false_rate: float = 0.02  # probability of a wrong detection at the place of an absent thing
+    prior: float = 0.1  # probability that the first detection at a place shows a thing
+    confirm: float = 0.8  # probability of existence from which a thing is present
+    gate: float = 0.3  # metres between detections of one small thing; more for a large thing
+    look: float = 0.5  # seconds between independent looks; faster frames count in proportion
+    hold: float = 3.0  # seconds in view until an alarm is raised or cleared
+    answers: int = 3  # looks until an alarm is raised or cleared
+    room_hold: float = 5.0  # seconds until the type of a room is settled, or changes
+    pause: float = 0.5  # seconds between questions
+    step: float = 0.1  # change of a probability, or metres of a position, that needs an answer
+    sensitivity: schemas.Sensitivity = "medium"  # rate of alarms of the service
+    timeout: float = 1.0  # maximum seconds of a question
+    save_every: float = 10.0  # seconds between writes of the file
 
 
 @dataclass
@@ -102,47 +80,48 @@ class Latch:
 
 @dataclass
 class Seen:
-    """One detection: the weight of each label, and its box."""
+    """One detection: the confidence of each label, and its box."""
 
     labels: dict[str, float]
     place: Vector | None = None
     size: Vector | None = None
     yaw: float | None = None
 
-    @property
-    def confidence(self) -> float:
-        """Probability that the detection shows a thing, with one of its labels."""
-        return min(1.0, sum(self.labels.values()))
+
+def read_detections(detections: Iterable[Any]) -> list[Seen]:
+    """Return the detections of a frame, or raise an `InvalidRequestError`."""
+    request = validated(schemas.SceneRequest, {"objects": list(detections)})
+    return [Seen({one: 1.0}) if isinstance(one, str) else _seen(one) for one in request.objects]
+
+
+def _seen(one: schemas.Detection) -> Seen:
+    labels = {guess.label: guess.confidence for guess in one.alternatives}
+    place = None if (at := one.position) is None else (at.x, at.y, at.z)
+    size = None if (box := one.size) is None else (box.x, box.y, box.z)
+    yaw = one.yaw
+    if (q := one.orientation) is not None:
+        yaw = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
+    return Seen(labels | {one.label: one.confidence}, place, size, yaw)
 
 
 @dataclass
 class Track:
-    """One thing.
-
-    Attributes:
-        votes: sum of the confidences of each label.
-        log_odds: ln(p / (1 - p)) of the probability p that the thing exists.
-        looks: number of looks with a detection.
-        missed: number of looks without a detection since the last detection.
-        verdict: last answer of the service: does not belong, in a wrong place, wrong detection, or
-            none of these. None without an answer.
-        alarm: the alarm of the thing.
-    """
+    """One thing, or a wrong detection as long as it is not confirmed."""
 
     id: str
-    room: str | None
-    log_odds: float
-    first: float
-    last: float
-    votes: dict[str, float] = field(default_factory=dict)
-    place: Vector | None = None
+    room: str
+    log_odds: float  # ln(p / (1 - p)) of the probability that the thing exists
+    first: float  # time of the first detection
+    last: float  # time of the last detection
+    votes: dict[str, float] = field(default_factory=dict)  # sum of confidences by label
+    place: Vector | None = None  # running mean, like the size
     size: Vector | None = None
     yaw: float | None = None
-    looks: float = 0.0
-    missed: float = 0.0
+    looks: float = 0.0  # number of looks with a detection
+    missed: float = 0.0  # number of looks without one, since the last detection
     is_confirmed: bool = False
-    verdict: str | None = None
-    probability: float = 0.0
+    verdict: str | None = None  # kind of alarm in the last answer
+    probability: float = 0.0  # of this verdict
     alarm: Latch = field(default_factory=Latch)
 
     @property
@@ -150,17 +129,27 @@ class Track:
         """Label with the most votes."""
         return max(self.votes, key=self.votes.__getitem__)
 
-    def share(self, label: str) -> float:
-        """Return the share of a label in the votes."""
-        return self.votes.get(label, 0.0) / sum(self.votes.values())
-
     @property
     def exists(self) -> float:
         """Probability that the thing exists."""
         return 1 / (1 + math.exp(-self.log_odds))
 
+    @property
+    def confidence(self) -> float:
+        """Probability that the thing exists and has its label."""
+        return self.exists * self.share(self.label)
+
+    def share(self, label: str) -> float:
+        """Return the share of a label in the votes."""
+        return self.votes.get(label, 0.0) / sum(self.votes.values())
+
+    def likeness(self, seen: Seen) -> float:
+        """Return the mean share of the labels of a detection, from 0 to 1."""
+        total = sum(seen.labels.values())
+        return sum(vote / total * self.share(label) for label, vote in seen.labels.items())
+
     def see(self, seen: Seen, now: float, weight: float) -> None:
-        """Add the votes of a detection, and its box to the running mean."""
+        """Add the votes of a detection, and its box to the running means."""
         for label, vote in seen.labels.items():
             self.votes[label] = self.votes.get(label, 0.0) + weight * vote
         self.looks += weight
@@ -170,82 +159,83 @@ class Track:
         self.yaw = self.yaw if seen.yaw is None else seen.yaw
         self.last, self.missed = now, 0.0
 
-    def likeness(self, seen: Seen) -> float:
-        """Return the share of the detection's labels in the votes, from 0 to 1."""
-        total = sum(seen.labels.values())
-        return sum(w / total * self.share(label) for label, w in seen.labels.items())
+    def as_object(self, shift: Vector) -> dict[str, Any]:
+        """Return the thing as an object of a request, in the frame of the map."""
+        label = self.label
+        thing: dict[str, Any] = {"id": self.id, "label": label}
+        thing["confidence"] = max(0.01, round(self.confidence, 3))
+        others = [(self.share(one), one) for one in self.votes if one != label]
+        if others and (second := max(others))[0] >= NOTABLE:
+            share = max(0.01, round(self.exists * second[0], 3))
+            thing["alternatives"] = [{"label": second[1], "confidence": share}]
+        if self.place is not None:
+            thing["position"] = [round(value, 3) for value in plus(self.place, shift)]
+        if self.size is not None:
+            thing["size"] = [round(value, 3) for value in self.size]
+        return thing if self.yaw is None else thing | {"yaw": round(self.yaw, 4)}
 
 
-@dataclass(frozen=True)
+@dataclass
 class Frame:
-    """What one call of `Home.update` says.
-
-    Attributes:
-        weight: number of independent looks, from 0 to 1.
-        pose: x, y and yaw of the robot.
-        view: full horizontal angle of the camera, and its reach.
-        room: room of the robot.
-        is_walled: whether rooms bound the view.
-    """
+    """One frame, and which tracks it looks at."""
 
     seen: list[Seen]
     now: float
-    weight: float
-    pose: Vector | None
-    view: Point | None
-    room: str | None
-    is_walled: bool
+    weight: float  # number of independent looks, 0 to 1
+    pose: Vector | None  # x, y and yaw of the robot
+    view: Point | None  # full horizontal angle of the camera, and its reach
+    room: str  # room of the robot
 
+    def chance(self, track: Track) -> float:
+        """Return the probability that the frame shows a track, if its thing exists.
 
-class Change(NamedTuple):
-    """The track of each detection of a frame, new things, and ended things."""
+        With a view, the track must be inside it. If no room bounds the view, the frame must also
+        show something farther away beside the track, or a wall may hide it. Without a view, the
+        frame must show things on both sides of the track, and one farther away. Without a position,
+        the frame must be about the same room.
+        """
+        if track.room != self.room:
+            return 0.0
+        if track.place is None or self.pose is None:
+            return LABELS if track.place is None else 0.0
+        angle, distance = self._polar(track.place)
+        if self.view is not None:
+            if 2 * abs(angle) > self.view[0] or distance > self.view[1]:
+                return 0.0
+            if self.room:
+                return FULL
+        beside = [(math.remainder(one - angle, math.tau), far) for one, far in self._seen_at]
+        beside = [(by, far) for by, far in beside if abs(by) < BESIDE]
+        if not any(far > distance for _, far in beside):
+            return 0.0
+        is_between = any(by > 0 for by, _ in beside) and any(by < 0 for by, _ in beside)
+        return FULL if self.view is not None else POSES if is_between else 0.0
 
-    seen: list[Track]
-    appeared: list[Track]
-    gone: list[Track]
+    @cached_property
+    def _seen_at(self) -> list[Point]:
+        return [self._polar(one.place) for one in self.seen if one.place is not None]
 
-
-def read_detections(detections: Iterable[Any]) -> list[Seen]:
-    """Return the detections of a frame.
-
-    Raises:
-        InvalidRequestError: a detection is invalid.
-    """
-    request = validated(schemas.SceneRequest, {"objects": list(detections)})
-    return [
-        Seen({one: 1.0})
-        if isinstance(one, str)
-        else Seen(
-            dict(Counter({guess.label: guess.confidence for guess in one.alternatives}))
-            | {one.label: one.confidence},
-            _vector(one.position),
-            _vector(one.size),
-            _yaw(one),
-        )
-        for one in request.objects
-    ]
+    def _polar(self, place: Vector) -> Point:
+        x, y, yaw = self.pose or (0.0, 0.0, 0.0)
+        dx, dy = place[0] - x, place[1] - y
+        return math.remainder(math.atan2(dy, dx) - yaw, math.tau), math.hypot(dx, dy)
 
 
 class Tracks:
     """All tracks of a home.
 
-    Args:
-        settings: the settings.
-        room_of: function that returns the room of a position and of the robot's room.
+    `room_of` returns the room of a position, given the room of the robot.
     """
 
-    def __init__(
-        self, settings: Settings, room_of: Callable[[Vector, str | None], str | None]
-    ) -> None:
-        self.settings = settings
-        self.room_of = room_of
+    def __init__(self, settings: Settings, room_of: Callable[[Vector, str], str]) -> None:
+        self.settings, self.room_of = settings, room_of
         self.all: dict[str, Track] = {}
-        self.shift: Vector = (0.0, 0.0, 0.0)
+        self.shift: Vector = (0.0, 0.0, 0.0)  # of the map since the start
         self.count = 0
         self._cells: dict[tuple[int, int], dict[str, Track]] = defaultdict(dict)
 
     def add(self, track: Track) -> None:
-        """Add a track, also one from a file."""
+        """Add a track."""
         self.all[track.id] = track
         if track.place is not None:
             self._cells[_cell(track.place)][track.id] = track
@@ -254,51 +244,41 @@ class Tracks:
         """Remove a track."""
         del self.all[track.id]
         if track.place is not None:
-            self._cells[_cell(track.place)].pop(track.id, None)
+            del self._cells[_cell(track.place)][track.id]
 
-    def update(self, frame: Frame) -> Change:
-        """Update the tracks with a frame.
+    def update(self, frame: Frame) -> tuple[list[Track], list[Track], list[Track]]:
+        """Return the track of each detection, the new things, and the gone things.
 
         Existence is a log-odds filter. With the probability v that the frame shows the thing, the
         hit rate h and the false rate f, a hit of confidence c adds c ln(v h / f), and a miss adds
         ln((1 - v h) / (1 - f)), each times the number of looks.
         """
-        s, view = self.settings, LookedAt(frame)
-        seen = self._associate(frame)
+        s, seen = self.settings, self._associate(frame)
         for track, one in zip(seen, frame.seen, strict=True):
             chance = LABELS if one.place is None else FULL
-            gain = one.confidence * math.log(chance * s.hit_rate / s.false_rate)
-            track.log_odds = min(MOST_CERTAIN, track.log_odds + frame.weight * gain)
-            self._see(track, one, frame)
-        hit, gone = {one.id for one in seen}, []
-        for track in list(self.all.values()):
-            if track.id in hit:
-                continue
-            if chance := view.chance(track):
-                loss = math.log((1 - chance * s.hit_rate) / (1 - s.false_rate))
-                track.log_odds += frame.weight * loss
+            hit = min(1.0, sum(one.labels.values())) * math.log(chance * s.hit_rate / s.false_rate)
+            track.log_odds = min(MOST_CERTAIN, track.log_odds + frame.weight * hit)
+            if track.place is not None:
+                del self._cells[_cell(track.place)][track.id]
+            track.see(one, frame.now, frame.weight)
+            if track.place is not None:
+                self._cells[_cell(track.place)][track.id] = track
+                track.room = self.room_of(track.place, frame.room)
+        hits, gone, appeared = {one.id for one in seen}, [], []
+        for track in [one for one in self.all.values() if one.id not in hits]:
+            if chance := frame.chance(track):
+                miss = math.log((1 - chance * s.hit_rate) / (1 - s.false_rate))
+                track.log_odds += frame.weight * miss
                 track.missed += frame.weight
             is_stale = not track.is_confirmed and frame.now - track.last > UNCONFIRMED
             if track.log_odds < math.log(s.false_rate) or is_stale:
                 self.remove(track)
                 gone += [track] if track.is_confirmed else []
-        appeared = []
         for index, track in enumerate(seen):
             if not track.is_confirmed and track.exists >= s.confirm:
                 seen[index] = self._confirm(track)
                 appeared += [track] if seen[index] is track else []
-        return Change(seen, appeared, gone)
-
-    def _see(self, track: Track, seen: Seen, frame: Frame) -> None:
-        before = track.place
-        track.see(seen, frame.now, frame.weight)
-        if track.place is None:
-            return
-        if before is None or _cell(before) != _cell(track.place):
-            if before is not None:
-                self._cells[_cell(before)].pop(track.id, None)
-            self._cells[_cell(track.place)][track.id] = track
-        track.room = self.room_of(track.place, frame.room)
+        return seen, appeared, gone
 
     def _confirm(self, track: Track) -> Track:
         """Confirm a new track. Return it, or the older track of the same thing if it has moved.
@@ -306,15 +286,15 @@ class Tracks:
         A thing that moved is the only one of its label that is not at its old place.
         """
         track.is_confirmed = True
-        moved = [
+        absent = [
             one
             for one in self.all.values()
             if one.is_confirmed and one.room == track.room and one.label == track.label
             and one.last < track.first and one.missed >= 2 and one.place is not None
         ]  # fmt: skip
-        if len(moved) != 1 or track.place is None:
+        if len(absent) != 1 or track.place is None:
             return track
-        old = moved[0]
+        old = absent[0]
         self.remove(track)
         self.remove(old)
         old.place, old.size, old.yaw = track.place, track.size, track.yaw
@@ -325,190 +305,112 @@ class Tracks:
     # ------------------------------------------------------------------------------ association
 
     def _associate(self, frame: Frame) -> list[Track]:
-        """Return the track of each detection. New things get new tracks."""
+        """Return the track of each detection, nearest first. New things get new tracks."""
         pairs = [
             (cost, index, track.id)
             for index, seen in enumerate(frame.seen)
-            for cost, track in self._candidates(seen, frame)
+            for cost, track in self._candidates(seen, frame.room)
         ]
+        track_of: dict[int, Track] = {}
         used: set[str] = set()
-        of: dict[int, Track] = {}
         for _, index, name in sorted(pairs):
-            if index not in of and name not in used:
-                of[index] = self.all[name]
+            if index not in track_of and name not in used:
+                track_of[index] = self.all[name]
                 used.add(name)
-        return [of.get(index) or self._new(frame) for index in range(len(frame.seen))]
+        return [track_of.get(index) or self._new(frame) for index in range(len(frame.seen))]
 
-    def _candidates(self, seen: Seen, frame: Frame) -> Iterator[tuple[float, Track]]:
+    def _candidates(self, seen: Seen, room: str) -> Iterator[tuple[float, Track]]:
         """Yield the tracks that a detection may show, with costs.
 
         The cost is the distance in gates, plus 1 minus the share of the labels in the votes.
+        Without a position, the older of two equal tracks comes first.
         """
         if seen.place is None:
             for rank, track in enumerate(self.all.values()):
-                if track.place is None and track.room == frame.room:
-                    if (like := track.likeness(seen)) >= 0.2:
-                        yield 1 - like + rank * 1e-6, track
+                is_here = track.place is None and track.room == room
+                if is_here and (like := track.likeness(seen)) >= NOTABLE:
+                    yield 1 - like + rank * 1e-6, track
             return
         i, j = _cell(seen.place)
         for cell in [(a, b) for a in (i - 1, i, i + 1) for b in (j - 1, j, j + 1)]:
             for track in self._cells.get(cell, {}).values():
                 distance = math.dist(seen.place, track.place or seen.place)
-                gate = self._gate(track.size or seen.size)
-                if distance > gate:
-                    continue
-                like = track.likeness(seen)
-                is_swap = distance < self.settings.gate and _are_similar(seen.size, track.size)
-                if like > 0 or is_swap:
+                side = max(track.size or seen.size or (0.0,))
+                gate = min(CELL, self.settings.gate + side / 4)
+                like = track.likeness(seen) if distance < gate else -1.0
+                is_near = distance < self.settings.gate and _are_similar(seen.size, track.size)
+                if like > 0 or (like == 0 and is_near):
                     yield distance / gate + 1 - like, track
-
-    def _gate(self, size: Vector | None) -> float:
-        return min(CELL, self.settings.gate + max(size or (0,)) / 4)
 
     def _new(self, frame: Frame) -> Track:
         self.count += 1
         prior = math.log(self.settings.prior / (1 - self.settings.prior))
         track = Track(f"t{self.count}", frame.room, prior, frame.now, frame.now)
-        self.all[track.id] = track
+        self.add(track)
         return track
 
-    def follow_shift(self, seen: list[Seen]) -> None:
-        """Follow a jump of the map, and subtract the shift of the map from the detections.
+    def follow_jump(self, seen: Iterable[Seen]) -> None:
+        """Subtract the shift of the map from the detections. Follow a jump of the map.
 
-        The shift changes if most detections of a frame agree on another one.
+        The map has jumped if most detections agree on one offset from tracks of the same label, at
+        least three and twice as many as with the old shift.
         """
         placed = [one for one in seen if one.place is not None]
-        self._find_shift(placed)
+        tracks = defaultdict(list)
+        for track in self.all.values():
+            if track.is_confirmed and track.place is not None:
+                tracks[track.label].append(track.place)
+        offsets = []
         for one in placed:
             one.place = minus(one.place or self.shift, self.shift)
+            by_label = tracks.get(max(one.labels, key=one.labels.__getitem__), ())
+            near = sorted((math.dist(one.place, at), at) for at in by_label)[:8]
+            offsets.append([minus(one.place, at) for far, at in near if far < FARTHEST_JUMP])
 
-    def _find_shift(self, placed: list[Seen]) -> None:
-        by_label = defaultdict(list)
-        labels = {label for one in placed for label in one.labels}
-        for track in self.all.values():
-            if track.is_confirmed and track.place is not None and (own := track.label) in labels:
-                by_label[own].append(track.place)
-        votes: Counter[tuple[int, int]] = Counter()
-        offsets = defaultdict(list)
-        width, here = self.settings.gate, 0
+        def alike(by: Vector) -> list[Vector]:
+            near = (min(some, key=lambda one: math.dist(one, by)) for some in offsets if some)
+            return [one for one in near if math.dist(one, by) < self.settings.gate]
+
+        unmoved = len(alike((0.0, 0.0, 0.0)))
+        if 2 * unmoved >= len(placed):
+            return
+        found = max((alike(by) for some in offsets for by in some), key=len, default=[])
+        if len(found) < max(3, 2 * unmoved) or 2 * len(found) <= len(placed):
+            return
+        x, y, z = (sum(axis) / len(found) for axis in zip(*found, strict=True))
+        self.shift = plus(self.shift, (x, y, z))
         for one in placed:
-            own = minus(one.place or self.shift, self.shift)
-            near = [
-                minus(own, place)
-                for place in by_label.get(max(one.labels, key=one.labels.__getitem__), ())
-                if math.dist(own, place) < FARTHEST_SHIFT
-            ]
-            here += any(math.hypot(*by) < width for by in near)
-            bins = {
-                (math.floor(x / width) + a, math.floor(y / width) + b)
-                for x, y, _ in near
-                for a in (0, 1)
-                for b in (0, 1)
-            }
-            votes.update(bins)
-            for x, y, z in near:
-                offsets[math.floor(x / width), math.floor(y / width)].append((x, y, z))
-        if not votes:
-            return
-        # A bin is a square of two by two cells, so that an edge does not divide the votes.
-        (i, j), count = max(votes.items(), key=lambda item: (item[1], -math.hypot(*item[0])))
-        if count < 3 or 2 * count <= len(placed) or 2 * here > count:
-            return
-        near = [by for a in (i - 1, i) for b in (j - 1, j) for by in offsets.get((a, b), ())]
-        middle = [sorted(axis)[len(near) // 2] for axis in zip(*near, strict=True)]
-        self.shift = plus(self.shift, (middle[0], middle[1], middle[2]))
+            one.place = minus(one.place or (x, y, z), (x, y, z))
 
 
-class LookedAt:
-    """Which tracks a frame looks at.
-
-    With a view, these are the tracks inside it. Without rooms, a wall may hide a track, so the
-    frame must show something at least as far in about the same direction. Without a view, the frame
-    must show things on both sides of the track, and one farther away. Without a position, the frame
-    must be about the same room.
-    """
-
-    def __init__(self, frame: Frame) -> None:
-        self._frame = frame
-        self._seen = [self._polar(one.place) for one in frame.seen if one.place is not None]
-
-    def chance(self, track: Track) -> float:
-        """Return the probability that the frame shows a track that exists."""
-        frame = self._frame
-        if frame.is_walled and track.room != frame.room:
-            return 0.0
-        if track.place is None:
-            return LABELS if track.room == frame.room else 0.0
-        if frame.pose is None:
-            return 0.0
-        angle, distance = self._polar(track.place)
-        if frame.view is not None:
-            if 2 * abs(angle) > frame.view[0] or distance > frame.view[1]:
-                return 0.0
-            if frame.is_walled:
-                return FULL
-        beside = [
-            (by, far)
-            for other, far in self._seen
-            if abs(by := math.remainder(other - angle, math.tau)) < _NEXT_TO
-        ]
-        if not any(far > distance for _, far in beside):
-            return 0.0
-        if frame.view is not None:
-            return FULL
-        return POSES if any(by > 0 for by, _ in beside) and any(by < 0 for by, _ in beside) else 0.0
-
-    def _polar(self, place: Vector) -> Point:
-        x, y, yaw = self._frame.pose or (0.0, 0.0, 0.0)
-        dx, dy = place[0] - x, place[1] - y
-        return math.remainder(math.atan2(dy, dx) - yaw, math.tau), math.hypot(dx, dy)
-
-
-def inside(point: Point, polygon: Iterable[Point]) -> bool:
+def inside(x: float, y: float, polygon: Iterable[Point]) -> bool:
     """Return whether a polygon contains a point (even-odd rule)."""
-    x, y = point
-    corners = list(polygon)
-    odd = False
+    corners, odd = list(polygon), False
     for (ax, ay), (bx, by) in zip(corners, corners[1:] + corners[:1], strict=True):
         if (ay > y) != (by > y) and x < ax + (y - ay) * (bx - ax) / (by - ay):
             odd = not odd
     return odd
 
 
-def to_edge(point: Point, polygon: Iterable[Point]) -> float:
-    """Return the distance from a point to the nearest edge of a polygon in metres."""
-    corners = list(polygon)
-    return min(
-        _to_segment(point, a, b) for a, b in zip(corners, corners[1:] + corners[:1], strict=True)
-    )
+def plus(a: Vector, b: Vector) -> Vector:
+    """Return a + b."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
-def _to_segment(point: Point, a: Point, b: Point) -> float:
-    dx, dy = b[0] - a[0], b[1] - a[1]
-    along = ((point[0] - a[0]) * dx + (point[1] - a[1]) * dy) / (dx * dx + dy * dy or 1.0)
-    along = max(0.0, min(1.0, along))
-    return math.hypot(point[0] - a[0] - along * dx, point[1] - a[1] - along * dy)
+def minus(a: Vector, b: Vector) -> Vector:
+    """Return a - b."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 def _cell(place: Vector) -> tuple[int, int]:
     return math.floor(place[0] / CELL), math.floor(place[1] / CELL)
 
 
-def plus(a: Vector, b: Vector) -> Vector:
-    """Return the sum of two vectors."""
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
-
-
-def minus(a: Vector, b: Vector) -> Vector:
-    """Return the difference of two vectors."""
-    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
-
-
 def _mean(old: Vector | None, new: Vector | None, share: float) -> Vector | None:
     if old is None or new is None:
         return new or old
-    x, y, z = (a + share * (b - a) for a, b in zip(old, new, strict=True))
-    return x, y, z
+    x, y, z = minus(new, old)
+    return plus(old, (share * x, share * y, share * z))
 
 
 def _are_similar(a: Vector | None, b: Vector | None) -> bool:
@@ -516,13 +418,3 @@ def _are_similar(a: Vector | None, b: Vector | None) -> bool:
         return True
     low, high = sorted((math.hypot(*a), math.hypot(*b)))
     return high <= SIMILAR * low
-
-
-def _vector(value: schemas.Position | schemas.Size | None) -> Vector | None:
-    return None if value is None else (value.x, value.y, value.z)
-
-
-def _yaw(one: schemas.Detection) -> float | None:
-    if (q := one.orientation) is None:
-        return one.yaw
-    return math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
