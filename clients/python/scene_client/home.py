@@ -6,21 +6,20 @@ docs/moving.md describes the class `Home`.
 from __future__ import annotations
 
 import atexit
-import json
 import logging
 import math
 import os
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, cast
 
-from pydantic import TypeAdapter
 from typing_extensions import Self
 
 from scene_client import schemas
-from scene_client.errors import ClientError, HomeFileError, InvalidRequestError
+from scene_client.errors import ClientError, InvalidRequestError
+from scene_client.home_file import Room, State, read_state, write_state
 from scene_client.recorder import Recorder
 from scene_client.tracks import (
     Frame,
@@ -39,7 +38,6 @@ from scene_client.tracks import (
 if TYPE_CHECKING:
     from scene_client.sync import Client
 
-VERSION: Final = 1  # of the file of a home
 EDGE: Final = 0.2  # metres outside of the robot's room in which a thing counts as inside
 NEAR: Final = 5.0  # metres around the robot; without rooms, the things within are its room
 LIKELY: Final = 0.2  # probability of existence from which a thing is evidence for the room type
@@ -67,33 +65,6 @@ class Event:
     room: str = ""  # name of the room; empty without names
     probability: float | None = None  # in the last answer
     detail: str | None = None  # the former alarm or type; the error of the service
-
-
-@dataclass
-class Room:
-    """What a home knows about one room."""
-
-    type: Latch = field(default_factory=Latch)
-    best: str | None = None  # likeliest type in the last answer
-    probability: float = 0.0  # of this type
-    is_named: bool | None = None  # whether the name is a room type; None before the first answer
-    headings: set[int] = field(default_factory=set)  # directions of the looks
-    looks: float = 0.0  # number of looks without a pose
-
-
-@dataclass
-class State:
-    """The contents of the file of a home."""
-
-    format: Literal["scene-home"] = "scene-home"
-    version: int = VERSION
-    stamp: float | None = None
-    room: str = ""
-    shift: Vector = (0.0, 0.0, 0.0)
-    count: int = 0
-    habits: set[tuple[str, str]] = field(default_factory=set)
-    rooms: dict[str, Room] = field(default_factory=dict)
-    tracks: dict[str, Track] = field(default_factory=dict)
 
 
 class Home:
@@ -142,7 +113,7 @@ class Home:
         self._asked: dict[str, dict[str, tuple[str, float, Vector | None]]] = {}
         self._lost: float | None = None  # seconds until the next try
         if self.path is not None:
-            self._load(self.path)
+            self._resume(read_state(self.path))
             atexit.register(self.close)
 
     # ---------------------------------------------------------------------------------- a frame
@@ -168,7 +139,7 @@ class Home:
             self._saved = self._next = self._now = now
         elapsed, self._now = now - self._now, now
         self._tracks.follow_jump(seen)
-        self._pose = None if pose is None else minus(_vector(pose), self._shift)
+        self._pose = None if pose is None else minus(_pose(pose), self._shift)
         if room is None and self._pose is not None and self._polygons:
             room = self._room_of(self._pose, "") or self.room
         self.room = room or ""
@@ -219,6 +190,8 @@ class Home:
         """Count the answer about the type of the robot's room, in proportion to its probability."""
         room = self._rooms[self.room]
         former, step = room.type.value, self._step(elapsed, self.settings.room_hold)
+        if room.is_named:
+            return
         if room.best and room.type.update(room.best, self._now, room.probability * step):
             yield Event(
                 "room", self._now, room.type.since, label=room.best, room=self.room,
@@ -383,7 +356,9 @@ class Home:
         """Ask where in the home a thing is. Other fields are those of `Client.where`."""
         rooms, common = [], {"searched": list(searched), "unknown_labels": UNKNOWN}
         for name, known in self._rooms.items():
-            scene = self._scene(self._things(name), name)
+            if not (things := self._things(name)) and not name:
+                continue
+            scene = self._scene(things, name)
             room = {"id": name or "here", "objects": scene.pop("objects")}
             if (kind := known.type.value or scene.pop("room_type", None)) is not None:
                 room["room_type"] = kind
@@ -420,48 +395,20 @@ class Home:
         Raises:
             OSError: the file cannot be written.
         """
-        if path is None and self.path is None:
+        if (target := path or self.path) is None:
             raise ValueError("the home has no file: name a path")
-        target, tracks = Path(path or self.path or ""), self._tracks
+        now, tracks = self._now if math.isfinite(self._now) else None, self._tracks
         state = State(
-            stamp=self._now if math.isfinite(self._now) else None, room=self.room,
-            shift=tracks.shift, count=tracks.count, habits=self.confirmed, rooms=self._rooms,
-            tracks=tracks.all,
-        )  # fmt: skip
-        sibling = target.with_name(f".{target.name}.{os.getpid()}")
-        try:
-            with sibling.open("wb") as file:
-                file.write(TypeAdapter(State).dump_json(state))
-                file.flush()
-                os.fsync(file.fileno())
-            sibling.replace(target)
-        finally:
-            sibling.unlink(missing_ok=True)
+            now, self.room, tracks.shift, tracks.count, self.confirmed, self._rooms, tracks.all
+        )
+        write_state(state, Path(target))
 
-    def _load(self, path: Path) -> None:
-        try:
-            text = path.read_bytes()
-            if (version := json.loads(text)["version"]) > VERSION:
-                raise HomeFileError(
-                    f"{path} has version {version}, but this client reads up to version {VERSION}. "
-                    "Install a newer client, or name another file."
-                )
-            state = TypeAdapter(State).validate_json(text)
-        except FileNotFoundError:
-            return
-        except (LookupError, OSError, TypeError, ValueError) as error:
-            if isinstance(error, HomeFileError):
-                raise
-            raise HomeFileError(
-                f"{path} is not a whole file of a home ({error}). Restore it, or name another "
-                "file. It is left as it is."
-            ) from None
-        tracks = self._tracks
-        self.room, self.confirmed, tracks.shift = state.room, state.habits, state.shift
-        tracks.count = state.count
+    def _resume(self, state: State) -> None:
+        self.room, self.confirmed = state.room, state.habits
+        self._tracks.shift, self._tracks.count = state.shift, state.count
         self._rooms |= state.rooms
         for track in state.tracks.values():
-            tracks.add(track)
+            self._tracks.add(track)
         self._now = self._saved = -math.inf if state.stamp is None else state.stamp
 
     def _try_save(self) -> None:
@@ -484,8 +431,8 @@ class Home:
         self.close()
 
 
-def _vector(values: Sequence[float] | Mapping[str, float]) -> Vector:
-    x, y, yaw = map(values.get, ("x", "y", "yaw")) if isinstance(values, Mapping) else values
+def _pose(values: Sequence[float] | Mapping[str, float]) -> Vector:
+    x, y, yaw = [values[n] for n in ("x", "y", "yaw")] if isinstance(values, Mapping) else values
     return float(x), float(y), float(yaw)
 
 

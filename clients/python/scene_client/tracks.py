@@ -204,11 +204,13 @@ class Frame:
                 return 0.0
             if self.room:
                 return FULL
+        if all(far < distance for _, far in self._seen_at):
+            return 0.0
         beside = [(math.remainder(one - angle, math.tau), far) for one, far in self._seen_at]
         beside = [(by, far) for by, far in beside if abs(by) < BESIDE]
-        if not any(far > distance for _, far in beside):
+        if all(far < distance for _, far in beside):
             return 0.0
-        is_between = any(by > 0 for by, _ in beside) and any(by < 0 for by, _ in beside)
+        is_between = min(beside)[0] < 0 < max(beside)[0]
         return FULL if self.view is not None else POSES if is_between else 0.0
 
     @cached_property
