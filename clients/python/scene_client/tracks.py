@@ -38,7 +38,7 @@ class Settings:
     hit_rate: float = 0.7  # probability that the detector reports a thing that the frame shows
     false_rate: float = 0.02  # probability of a wrong detection at the place of an absent thing
     prior: float = 0.1  # probability that the first detection at a place shows a thing
-    confirm: float = 0.8  # probability of existence from which a thing is present
+    confirm: float = 0.9  # probability of existence from which a thing is present
     gate: float = 0.3  # metres between detections of one small thing; more for a large thing
     look: float = 0.5  # seconds between independent looks; faster frames count in proportion
     hold: float = 3.0  # seconds in view until an alarm is raised or cleared
