@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     )
     from scene_client.files import from_file
     from scene_client.formats import from_data
-    from scene_client.home import Event, Home
+    from scene_client.home import Home
+    from scene_client.home_state import Event
     from scene_client.offline import OfflineClient
     from scene_client.recorder import Recorder
     from scene_client.sync import Client
@@ -38,7 +39,7 @@ __all__ = [
 # Maps each name to the module that defines the name. The package imports the module on first use of
 # the name. So the service, which needs only the schemas, starts without httpx.
 _MODULES = {
-    "AsyncClient": "asynchronous", "Client": "sync", "Event": "home", "Home": "home",
+    "AsyncClient": "asynchronous", "Client": "sync", "Event": "home_state", "Home": "home",
     "OfflineClient": "offline", "Recorder": "recorder", "Settings": "tracks",
     "from_data": "formats", "from_file": "files",
 }  # fmt: skip

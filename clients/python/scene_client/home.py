@@ -11,15 +11,14 @@ import math
 import os
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from typing_extensions import Self
 
 from scene_client import schemas
 from scene_client.errors import ClientError, InvalidRequestError
-from scene_client.home_file import Room, State, read_state, write_state
+from scene_client.home_state import Event, Kind, Room, State, read_state, write_state
 from scene_client.recorder import Recorder
 from scene_client.tracks import (
     Frame,
@@ -47,24 +46,7 @@ LOST_TIMEOUT: Final = 0.3  # seconds of a try while the service is lost
 FIRST_PAUSE, LONGEST_PAUSE = 2.0, 30.0  # seconds between tries; the pause doubles each time
 UNKNOWN: Final = "nearest-or-ignore"
 
-Kind = Literal[
-    "appeared", "gone", "out-of-place", "misplaced", "misdetection", "cleared", "room", "service"
-]
 _logger: Final = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Event:
-    """One change of a home, or an alarm that is on."""
-
-    kind: Kind
-    stamp: float  # time of the change
-    since: float  # start of what the event reports
-    id: str | None = None  # track of the thing
-    label: str | None = None  # of the thing; type of the room; service `lost` or `back`
-    room: str = ""  # name of the room; empty without names
-    probability: float | None = None  # in the last answer
-    detail: str | None = None  # the former alarm or type; the error of the service
 
 
 class Home:
@@ -79,11 +61,6 @@ class Home:
         room_candidates: possible room types of the rooms whose name is no room type.
         record: file ``*.jsonl`` for confirmed scenes, as ``training adapt`` reads them.
         settings: the settings.
-
-    Attributes:
-        room: name of the robot's room.
-        matched: track of each detection of the last frame.
-        confirmed: the habits: pairs of a label and a room.
 
     Raises:
         HomeFileError: the file is damaged, or of a newer version.
@@ -102,8 +79,9 @@ class Home:
     ) -> None:
         self.client, self.view, self.settings = client, view, settings or Settings()
         self.path = None if path is None else Path(path)
-        self.room, self.matched = "", list[str]()
-        self.confirmed: set[tuple[str, str]] = set()
+        self.room = ""  # of the robot
+        self.matched: list[str] = []  # track of each detection of the last frame
+        self.confirmed: set[tuple[str, str]] = set()  # habits: label and room
         self._polygons, self._candidates = dict(rooms or {}), list(room_candidates)
         self._recorder = None if record is None else Recorder(record)
         self._rooms = {name: Room() for name in self._polygons}
@@ -139,7 +117,7 @@ class Home:
             self._saved = self._next = self._now = now
         elapsed, self._now = now - self._now, now
         self._tracks.follow_jump(seen)
-        self._pose = None if pose is None else minus(_pose(pose), self._shift)
+        self._pose = None if pose is None else minus(_pose(pose), self._tracks.shift)
         if room is None and self._pose is not None and self._polygons:
             room = self._room_of(self._pose, "") or self.room
         self.room = room or ""
@@ -156,10 +134,6 @@ class Home:
         if self.path is not None and now - self._saved >= self.settings.save_every:
             self._try_save()
         return events
-
-    @property
-    def _shift(self) -> Vector:
-        return (*self._tracks.shift[:2], 0.0)  # of a pose
 
     def _room_of(self, place: Vector, robot_room: str) -> str:
         """Return the room of a thing. Things at the edge belong to the room of the robot."""
@@ -190,11 +164,10 @@ class Home:
         """Count the answer about the type of the robot's room, in proportion to its probability."""
         room = self._rooms[self.room]
         former, step = room.type.value, self._step(elapsed, self.settings.room_hold)
-        if room.is_named:
-            return
-        if room.best and room.type.update(room.best, self._now, room.probability * step):
+        best = None if room.is_named else room.best
+        if best and room.type.update(best, self._now, room.probability * step):
             yield Event(
-                "room", self._now, room.type.since, label=room.best, room=self.room,
+                "room", self._now, room.type.since, label=best, room=self.room,
                 probability=room.probability, detail=former,
             )  # fmt: skip
 
@@ -301,8 +274,11 @@ class Home:
         Until the type is settled, this is the likeliest type.
         """
         name = self.room if room is None else room
-        known = self._rooms.get(name, Room())
-        return name if known.is_named else known.type.value or known.best
+        return self._settled_type(name) or self._rooms.get(name, Room()).best
+
+    def _settled_type(self, name: str) -> str | None:
+        room = self._rooms.get(name, Room())
+        return name if room.is_named else room.type.value
 
     def coverage(self, room: str | None = None) -> float:
         """Return the share of a room that the robot has seen, from .2 at first sight to .9."""
@@ -324,7 +300,7 @@ class Home:
         if any("position" in one for one in objects):
             scene["frame_id"] = "map"
             if self._pose is not None:
-                at = plus(self._pose, self._shift)
+                at = plus(self._pose, self._tracks.shift)
                 scene["viewpoint"] = dict(zip(("x", "y", "yaw"), at, strict=True))
         if room and self._rooms.get(room, Room()).is_named is not False:
             scene["room_type"] = room
@@ -355,12 +331,12 @@ class Home:
     ) -> schemas.WhereAnswer:
         """Ask where in the home a thing is. Other fields are those of `Client.where`."""
         rooms, common = [], {"searched": list(searched), "unknown_labels": UNKNOWN}
-        for name, known in self._rooms.items():
+        for name in self._rooms:
             if not (things := self._things(name)) and not name:
                 continue
             scene = self._scene(things, name)
-            room = {"id": name or "here", "objects": scene.pop("objects")}
-            if (kind := known.type.value or scene.pop("room_type", None)) is not None:
+            room = {"id": name or "here", "objects": scene["objects"]}
+            if (kind := self._settled_type(name)) is not None:
                 room["room_type"] = kind
             rooms.append(room | {"coverage": self.coverage(name)})
             common |= {one: scene[one] for one in ("frame_id", "viewpoint") if one in scene}
@@ -383,7 +359,8 @@ class Home:
                 events.append(self._event("cleared", one, self._now, former))
         if self._recorder is not None:
             quiet = [one for one in self._things(track.room) if one.alarm.value is None]
-            scene = self._scene(quiet, track.room) | {"confirmed": True}
+            kind = self._settled_type(track.room)
+            scene = self._scene(quiet, track.room) | {"confirmed": True, "room_type": kind}
             self._recorder.confirm(schemas.SceneRequest.model_validate(scene))
         return events
 

@@ -232,7 +232,7 @@ class Tracks:
     def __init__(self, settings: Settings, room_of: Callable[[Vector, str], str]) -> None:
         self.settings, self.room_of = settings, room_of
         self.all: dict[str, Track] = {}
-        self.shift: Vector = (0.0, 0.0, 0.0)  # of the map since the start
+        self.shift: Vector = (0.0, 0.0, 0.0)  # of the map since the start, in the plane
         self.count = 0
         self._cells: dict[tuple[int, int], dict[str, Track]] = defaultdict(dict)
 
@@ -379,10 +379,10 @@ class Tracks:
         found = max((alike(by) for some in offsets for by in some), key=len, default=[])
         if len(found) < max(3, 2 * unmoved) or 2 * len(found) <= len(placed):
             return
-        x, y, z = (sum(axis) / len(found) for axis in zip(*found, strict=True))
-        self.shift = plus(self.shift, (x, y, z))
+        x, y, _ = (sum(axis) / len(found) for axis in zip(*found, strict=True))
+        self.shift, jump = plus(self.shift, (x, y, 0.0)), (x, y, 0.0)
         for one in placed:
-            one.place = minus(one.place or (x, y, z), (x, y, z))
+            one.place = minus(one.place or jump, jump)
 
 
 def inside(x: float, y: float, polygon: Iterable[Point]) -> bool:

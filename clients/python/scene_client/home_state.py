@@ -1,4 +1,4 @@
-"""The file of a home, versioned JSON: what a `Home` needs to go on after a restart."""
+"""The events of a home, and its state in a file, from which it resumes after a restart."""
 
 from __future__ import annotations
 
@@ -13,7 +13,25 @@ from pydantic import TypeAdapter
 from scene_client.errors import HomeFileError
 from scene_client.tracks import Latch, Track, Vector
 
-VERSION: Final = 1
+VERSION: Final = 1  # of the file
+
+Kind = Literal[
+    "appeared", "gone", "out-of-place", "misplaced", "misdetection", "cleared", "room", "service"
+]
+
+
+@dataclass(frozen=True)
+class Event:
+    """One change of a home, or an alarm that is on."""
+
+    kind: Kind
+    stamp: float  # time of the change
+    since: float  # start of what the event reports
+    id: str | None = None  # track of the thing
+    label: str | None = None  # of the thing; type of the room; service `lost` or `back`
+    room: str = ""  # name of the room; empty without names
+    probability: float | None = None  # in the last answer
+    detail: str | None = None  # the former alarm or type; the error of the service
 
 
 @dataclass
