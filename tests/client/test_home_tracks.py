@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from scene_client import Home, InvalidRequestError, Settings
-from scene_client.tracks import FULL, LABELS, MOST_CERTAIN, POSES, Latch, inside
+from scene_client.home_state import inside
+from scene_client.tracks import FULL, LABELS, MOST_CERTAIN, POSES, Latch
 from tests.client.homes import FakeClient, thing
 
 VIEW = (math.radians(90), 5.0)

@@ -1,6 +1,6 @@
 """A home: what a moving robot knows about its rooms, between a detector and the questions.
 
-docs/moving.md describes the class `Home`.
+docs/moving.md describes it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing_extensions import Self
 
 from scene_client import schemas
 from scene_client.errors import ClientError, InvalidRequestError
-from scene_client.home_state import Event, Kind, Room, State, read_state, write_state
+from scene_client.home_state import Event, Kind, Room, State, inside, read_state, write_state
 from scene_client.recorder import Recorder
 from scene_client.tracks import (
     Frame,
@@ -28,7 +28,6 @@ from scene_client.tracks import (
     Track,
     Tracks,
     Vector,
-    inside,
     minus,
     plus,
     read_detections,
@@ -41,7 +40,6 @@ EDGE: Final = 0.2  # metres outside of the robot's room in which a thing counts 
 NEAR: Final = 5.0  # metres around the robot; without rooms, the things within are its room
 LIKELY: Final = 0.2  # probability of existence from which a thing is evidence for the room type
 MARGIN: Final = 0.1  # difference of probabilities from which another room type is likelier
-HEADINGS, LOOKS = 8, 30  # directions, or looks without poses, that show a whole room
 LOST_TIMEOUT: Final = 0.3  # seconds of a try while the service is lost
 FIRST_PAUSE, LONGEST_PAUSE = 2.0, 30.0  # seconds between tries; the pause doubles each time
 UNKNOWN: Final = "nearest-or-ignore"
@@ -122,7 +120,7 @@ class Home:
             room = self._room_of(self._pose, "") or self.room
         self.room = room or ""
         weight = min(1.0, elapsed / self.settings.look)
-        self._count_look(weight)
+        self._rooms.setdefault(self.room, Room()).look(self._pose, weight)
         frame = Frame(seen, now, weight, self._pose, view or self.view, self.room)
         tracks, appeared, gone = self._tracks.update(frame)
         self.matched = [one.id for one in tracks]
@@ -137,19 +135,11 @@ class Home:
 
     def _room_of(self, place: Vector, robot_room: str) -> str:
         """Return the room of a thing. Things at the edge belong to the room of the robot."""
-        x, y, _ = place
-        polygon = self._polygons.get(robot_room, ())
+        (x, y, _), polygon = place, self._polygons.get(robot_room, ())
         around = ((x, y), (x - EDGE, y), (x + EDGE, y), (x, y - EDGE), (x, y + EDGE))
         if not self._polygons or any(inside(*at, polygon) for at in around):
             return robot_room
         return next((one for one, edge in self._polygons.items() if inside(x, y, edge)), "")
-
-    def _count_look(self, weight: float) -> None:
-        room = self._rooms.setdefault(self.room, Room())
-        if self._pose is None:
-            room.looks += weight
-        else:
-            room.headings.add(math.floor(self._pose[2] / math.tau * HEADINGS) % HEADINGS)
 
     def _alarms(self, seen: Iterable[Track], elapsed: float) -> Iterator[Event]:
         """Count the verdicts about the seen things. Alarms of unseen things stay as they are."""
@@ -157,8 +147,9 @@ class Home:
         for track in seen:
             verdict, former = None if self._is_habit(track) else track.verdict, track.alarm.value
             if track.is_confirmed and track.alarm.update(verdict, self._now, step):
-                kind = cast(Kind, verdict or "cleared")
-                yield self._event(kind, track, track.alarm.since, former)
+                yield self._event(
+                    cast(Kind, verdict or "cleared"), track, track.alarm.since, former
+                )
 
     def _settle(self, elapsed: float) -> Iterator[Event]:
         """Count the answer about the type of the robot's room, in proportion to its probability."""
@@ -172,7 +163,7 @@ class Home:
             )  # fmt: skip
 
     def _step(self, elapsed: float, hold: float) -> float:
-        # One look counts at most a second, so a pause is no evidence.
+        # One look counts at most a second, because a pause says nothing about the answer.
         looks = min(1.0, elapsed / self.settings.look)
         return min(min(1.0, elapsed) / hold, looks / self.settings.answers)
 
@@ -216,9 +207,8 @@ class Home:
             return True
         for one in things:
             label, confidence, place = asked[one.id]
-            if label != one.label or abs(confidence - one.confidence) > step:
-                return True
-            if place is not None and math.dist(place, one.place or place) > step:
+            has_moved = place and one.place and math.dist(place, one.place) > step
+            if label != one.label or abs(confidence - one.confidence) > step or has_moved:
                 return True
         return False
 
@@ -235,9 +225,8 @@ class Home:
         room.probability = types.get(room.best or "", 0.0)
 
     def _ask_outliers(self, room: Room, things: list[Track], timeout: float) -> None:
-        scene = self._scene(things, self.room)
-        sensitivity = self.settings.sensitivity
-        answer = self.client.outliers(**scene, sensitivity=sensitivity, timeout=timeout)
+        scene = self._scene(things, self.room) | {"sensitivity": self.settings.sensitivity}
+        answer = self.client.outliers(**scene, timeout=timeout)
         if "room_type" in scene and room.is_named is None:
             guessed = [one.label for one in answer.mapped if one.similarity < 1]
             room.is_named = self.room not in (*answer.ignored, *guessed)
@@ -269,10 +258,7 @@ class Home:
         return present if room is None else [one for one in present if one.room == room]
 
     def room_type(self, room: str | None = None) -> str | None:
-        """Return the type of a room, by default of the robot's room. None means unknown.
-
-        Until the type is settled, this is the likeliest type.
-        """
+        """Return the type of a room, by default of the robot's room, or else the likeliest one."""
         name = self.room if room is None else room
         return self._settled_type(name) or self._rooms.get(name, Room()).best
 
@@ -282,15 +268,10 @@ class Home:
 
     def coverage(self, room: str | None = None) -> float:
         """Return the share of a room that the robot has seen, from .2 at first sight to .9."""
-        known = self._rooms.get(self.room if room is None else room, Room())
-        share = max(len(known.headings) / HEADINGS, known.looks / LOOKS)
-        return 0.2 + 0.7 * min(1.0, share)
+        return self._rooms.get(self.room if room is None else room, Room()).coverage
 
     def scene(self, room: str | None = None) -> dict[str, Any]:
-        """Return the fields of a request about a room, by default about the robot's room.
-
-        ``client.outliers(**home.scene("kitchen"))`` asks about a room.
-        """
+        """Return the fields of a request about a room, by default about the robot's room."""
         name = self.room if room is None else room
         return self._scene(self._things(name), name)
 
@@ -307,10 +288,7 @@ class Home:
         return scene
 
     def _things(self, room: str, exists: float | None = None) -> list[Track]:
-        """Return the most certain things of a room, by default of the present ones.
-
-        Without rooms, these are the things near the robot.
-        """
+        """Return the most certain (present) things of a room, or without rooms of those nearby."""
         here = None if room else self._pose
         found = [
             one
@@ -338,7 +316,7 @@ class Home:
             room = {"id": name or "here", "objects": scene["objects"]}
             if (kind := self._settled_type(name)) is not None:
                 room["room_type"] = kind
-            rooms.append(room | {"coverage": self.coverage(name)})
+            rooms.append(room | {"coverage": self._rooms[name].coverage})
             common |= {one: scene[one] for one in ("frame_id", "viewpoint") if one in scene}
         return self.client.where(label, rooms, **{**common, **fields})
 

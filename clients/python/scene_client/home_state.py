@@ -1,9 +1,11 @@
-"""The events of a home, and its state in a file, from which it resumes after a restart."""
+"""The events and rooms of a home, and the file from which it resumes after a restart."""
 
 from __future__ import annotations
 
 import json
+import math
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Literal
@@ -11,9 +13,10 @@ from typing import Final, Literal
 from pydantic import TypeAdapter
 
 from scene_client.errors import HomeFileError
-from scene_client.tracks import Latch, Track, Vector
+from scene_client.tracks import Latch, Point, Track, Vector
 
 VERSION: Final = 1  # of the file
+HEADINGS, LOOKS = 8, 30  # directions, or looks without poses, that show a whole room
 
 Kind = Literal[
     "appeared", "gone", "out-of-place", "misplaced", "misdetection", "cleared", "room", "service"
@@ -44,6 +47,27 @@ class Room:
     is_named: bool | None = None  # whether the name is a room type; None before the first answer
     headings: set[int] = field(default_factory=set)  # directions of the looks
     looks: float = 0.0  # number of looks without a pose
+
+    def look(self, pose: Vector | None, weight: float) -> None:
+        """Count a look."""
+        if pose is None:
+            self.looks += weight
+        else:
+            self.headings.add(math.floor(pose[2] / math.tau * HEADINGS) % HEADINGS)
+
+    @property
+    def coverage(self) -> float:
+        """Share of the room that the robot has seen."""
+        return 0.2 + 0.7 * min(1.0, max(len(self.headings) / HEADINGS, self.looks / LOOKS))
+
+
+def inside(x: float, y: float, polygon: Iterable[Point]) -> bool:
+    """Return whether a polygon contains a point (even-odd rule)."""
+    corners, odd = list(polygon), False
+    for (ax, ay), (bx, by) in zip(corners, corners[1:] + corners[:1], strict=True):
+        if (ay > y) != (by > y) and x < ax + (y - ay) * (bx - ax) / (by - ay):
+            odd = not odd
+    return odd
 
 
 @dataclass

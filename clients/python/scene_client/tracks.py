@@ -1,7 +1,6 @@
 """Tracks of things: which detections show one thing, whether the thing exists, and its label.
 
-docs/moving.md describes the tracks. Lengths are in metres in the frame ``map``, angles in radians,
-and times in seconds.
+Lengths are in metres in the frame ``map``, angles in radians, and times in seconds.
 """
 
 from __future__ import annotations
@@ -145,8 +144,8 @@ class Track:
 
     def likeness(self, seen: Seen) -> float:
         """Return the mean share of the labels of a detection, from 0 to 1."""
-        total = sum(seen.labels.values())
-        return sum(vote / total * self.share(label) for label, vote in seen.labels.items())
+        shares = sum(vote * self.share(label) for label, vote in seen.labels.items())
+        return shares / sum(seen.labels.values())
 
     def see(self, seen: Seen, now: float, weight: float) -> None:
         """Add the votes of a detection, and its box to the running means."""
@@ -204,7 +203,7 @@ class Frame:
                 return 0.0
             if self.room:
                 return FULL
-        if all(far < distance for _, far in self._seen_at):
+        if not self._seen_at or distance > self._seen_at[0][1]:
             return 0.0
         beside = [(math.remainder(one - angle, math.tau), far) for one, far in self._seen_at]
         beside = [(by, far) for by, far in beside if abs(by) < BESIDE]
@@ -215,7 +214,8 @@ class Frame:
 
     @cached_property
     def _seen_at(self) -> list[Point]:
-        return [self._polar(one.place) for one in self.seen if one.place is not None]
+        found = [self._polar(one.place) for one in self.seen if one.place is not None]
+        return sorted(found, key=lambda one: -one[1])  # farthest first
 
     def _polar(self, place: Vector) -> Point:
         x, y, yaw = self.pose or (0.0, 0.0, 0.0)
@@ -224,10 +224,7 @@ class Frame:
 
 
 class Tracks:
-    """All tracks of a home.
-
-    `room_of` returns the room of a position, given the room of the robot.
-    """
+    """All tracks of a home. `room_of` returns the room of a position and of the robot's room."""
 
     def __init__(self, settings: Settings, room_of: Callable[[Vector, str], str]) -> None:
         self.settings, self.room_of = settings, room_of
@@ -283,10 +280,7 @@ class Tracks:
         return seen, appeared, gone
 
     def _confirm(self, track: Track) -> Track:
-        """Confirm a new track. Return it, or the older track of the same thing if it has moved.
-
-        A thing that moved is the only one of its label that is not at its old place.
-        """
+        """Confirm a new track. Return it, or the only absent one of its label, which has moved."""
         track.is_confirmed = True
         absent = [
             one
@@ -296,15 +290,12 @@ class Tracks:
         ]  # fmt: skip
         if len(absent) != 1 or track.place is None:
             return track
-        old = absent[0]
-        self.remove(track)
-        self.remove(old)
+        for one in (track, old := absent[0]):
+            self.remove(one)
         old.place, old.size, old.yaw = track.place, track.size, track.yaw
         old.looks, old.last, old.missed = track.looks, track.last, 0.0
         self.add(old)
         return old
-
-    # ------------------------------------------------------------------------------ association
 
     def _associate(self, frame: Frame) -> list[Track]:
         """Return the track of each detection, nearest first. New things get new tracks."""
@@ -313,8 +304,7 @@ class Tracks:
             for index, seen in enumerate(frame.seen)
             for cost, track in self._candidates(seen, frame.room)
         ]
-        track_of: dict[int, Track] = {}
-        used: set[str] = set()
+        track_of, used = dict[int, Track](), set[str]()
         for _, index, name in sorted(pairs):
             if index not in track_of and name not in used:
                 track_of[index] = self.all[name]
@@ -322,10 +312,9 @@ class Tracks:
         return [track_of.get(index) or self._new(frame) for index in range(len(frame.seen))]
 
     def _candidates(self, seen: Seen, room: str) -> Iterator[tuple[float, Track]]:
-        """Yield the tracks that a detection may show, with costs.
+        """Yield costs and tracks that a detection may show. Without positions, older ones first.
 
         The cost is the distance in gates, plus 1 minus the share of the labels in the votes.
-        Without a position, the older of two equal tracks comes first.
         """
         if seen.place is None:
             for rank, track in enumerate(self.all.values()):
@@ -385,22 +374,13 @@ class Tracks:
             one.place = minus(one.place or jump, jump)
 
 
-def inside(x: float, y: float, polygon: Iterable[Point]) -> bool:
-    """Return whether a polygon contains a point (even-odd rule)."""
-    corners, odd = list(polygon), False
-    for (ax, ay), (bx, by) in zip(corners, corners[1:] + corners[:1], strict=True):
-        if (ay > y) != (by > y) and x < ax + (y - ay) * (bx - ax) / (by - ay):
-            odd = not odd
-    return odd
-
-
 def plus(a: Vector, b: Vector) -> Vector:
-    """Return a + b."""
+    """Return the sum of two vectors."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 def minus(a: Vector, b: Vector) -> Vector:
-    """Return a - b."""
+    """Return the difference of two vectors."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
@@ -416,7 +396,5 @@ def _mean(old: Vector | None, new: Vector | None, share: float) -> Vector | None
 
 
 def _are_similar(a: Vector | None, b: Vector | None) -> bool:
-    if a is None or b is None:
-        return True
-    low, high = sorted((math.hypot(*a), math.hypot(*b)))
+    low, high = sorted((math.hypot(*(a or b or ())), math.hypot(*(b or a or ()))))
     return high <= SIMILAR * low
