@@ -137,6 +137,20 @@ def test_names_that_are_no_room_types_get_a_type_that_does_not_flicker(client):
     assert [(e.label, e.detail) for e in events if e.kind == "room"] == [("bathroom", "kitchen")]
 
 
+def test_things_and_robots_stay_in_their_room_at_its_edges(client):
+    one = home(client)
+    run(one, range(5), [thing("towel", 6.1)], (4.0, 0.0, 0.0))  # 10 cm beyond the wall
+    assert [track.room for track in one.things()] == ["kitchen"]
+    run(one, range(5, 10), [thing("towel", 5.9)], (7.9, 0.0, math.pi))
+    assert [track.room for track in one.things()] == ["kitchen"]
+    run(one, range(10, 60), [thing("towel", 6.4)], (7.9, 0.0, math.pi))
+    assert [track.room for track in one.things()] == ["area 2"]
+    places = [(5.9, "area 2"), (5.7, "kitchen"), (6.1, "kitchen"), (6.3, "area 2"), (20, "area 2")]
+    for x, room in places:
+        one.update([], (x, 0.0, 0.0), 60.0)
+        assert one.room == room
+
+
 def test_a_room_without_polygons(client):
     one = home(client, rooms=None)
     events = run(one, range(20), [*KITCHEN, thing("bed", 4.9)])
@@ -197,6 +211,14 @@ def test_a_confirmed_habit_stays_quiet_and_is_recorded(client, tmp_path):
     assert labels == ["fridge", "stove", "toilet", "toilet"]  # not the towel, an open alarm
     with pytest.raises(KeyError):
         one.confirm("t99")
+
+
+def test_the_settled_type_of_a_room_is_recorded(client, tmp_path):
+    one = home(client, record=tmp_path / "scenes.jsonl")
+    run(one, range(20), [thing("stove", 8.0), thing("fridge", 9.0, 1.0)], BESIDE)
+    assert one.confirm(one.things("area 2")[0].id) == []  # no alarm was on
+    (scene,) = read_jsonl(tmp_path / "scenes.jsonl")
+    assert (scene.room_type, scene.confirmed) == ("kitchen", True)
 
 
 def test_other_rooms_are_not_confirmed(client):

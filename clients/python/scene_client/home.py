@@ -1,7 +1,4 @@
-"""A home: what a moving robot knows about its rooms, between a detector and the questions.
-
-docs/moving.md describes it.
-"""
+"""What a moving robot knows about a home, between a detector and questions (docs/moving.md)."""
 
 from __future__ import annotations
 
@@ -36,7 +33,7 @@ from scene_client.tracks import (
 if TYPE_CHECKING:
     from scene_client.sync import Client
 
-EDGE: Final = 0.2  # metres outside of the robot's room in which a thing counts as inside
+EDGE: Final = 0.2  # metres outside of a room until a thing, or the robot, has left it
 NEAR: Final = 5.0  # metres around the robot; without rooms, the things within are its room
 LIKELY: Final = 0.2  # probability of existence from which a thing is evidence for the room type
 MARGIN: Final = 0.1  # difference of probabilities from which another room type is likelier
@@ -117,7 +114,7 @@ class Home:
         self._tracks.follow_jump(seen)
         self._pose = None if pose is None else minus(_pose(pose), self._tracks.shift)
         if room is None and self._pose is not None and self._polygons:
-            room = self._room_of(self._pose, "") or self.room
+            room = self._room_of(self._pose, self.room) or self.room
         self.room = room or ""
         weight = min(1.0, elapsed / self.settings.look)
         self._rooms.setdefault(self.room, Room()).look(self._pose, weight)
@@ -133,12 +130,14 @@ class Home:
             self._try_save()
         return events
 
-    def _room_of(self, place: Vector, robot_room: str) -> str:
-        """Return the room of a thing. Things at the edge belong to the room of the robot."""
-        (x, y, _), polygon = place, self._polygons.get(robot_room, ())
+    def _room_of(self, place: Vector, room: str) -> str:
+        """Return the room of a place. At its edges, a thing or a robot stays in its `room`."""
+        (x, y, _), polygon = place, self._polygons.get(room, ())
         around = ((x, y), (x - EDGE, y), (x + EDGE, y), (x, y - EDGE), (x, y + EDGE))
-        if not self._polygons or any(inside(*at, polygon) for at in around):
-            return robot_room
+        if not self._polygons:
+            return self.room
+        if any(inside(*at, polygon) for at in around):
+            return room
         return next((one for one, edge in self._polygons.items() if inside(x, y, edge)), "")
 
     def _alarms(self, seen: Iterable[Track], elapsed: float) -> Iterator[Event]:

@@ -224,7 +224,7 @@ class Frame:
 
 
 class Tracks:
-    """All tracks of a home. `room_of` returns the room of a position and of the robot's room."""
+    """All tracks of a home. `room_of` returns the room of a place, given its room before."""
 
     def __init__(self, settings: Settings, room_of: Callable[[Vector, str], str]) -> None:
         self.settings, self.room_of = settings, room_of
@@ -262,7 +262,7 @@ class Tracks:
             track.see(one, frame.now, frame.weight)
             if track.place is not None:
                 self._cells[_cell(track.place)][track.id] = track
-                track.room = self.room_of(track.place, frame.room)
+                track.room = self.room_of(track.place, track.room)
         hits, gone, appeared = {one.id for one in seen}, [], []
         for track in [one for one in self.all.values() if one.id not in hits]:
             if chance := frame.chance(track):
