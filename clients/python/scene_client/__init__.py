@@ -18,7 +18,7 @@ if TYPE_CHECKING:
         ProblemError,
         UnreachableError,
     )
-    from scene_client.files import from_file
+    from scene_client.files import from_file, rooms_from_file
     from scene_client.formats import from_data
     from scene_client.offline import OfflineClient
     from scene_client.recorder import Recorder
@@ -29,6 +29,7 @@ __version__ = "2.0.0"
 __all__ = [
     "AnswerError", "AsyncClient", "Client", "ClientError", "DeadlineError", "InvalidRequestError",
     "OfflineClient", "ProblemError", "Recorder", "UnreachableError", "from_data", "from_file",
+    "rooms_from_file",
 ]  # fmt: skip
 
 # Maps each name to the module that defines the name. The package imports the module on first use of
@@ -36,6 +37,7 @@ __all__ = [
 _MODULES = {
     "AsyncClient": "asynchronous", "Client": "sync", "OfflineClient": "offline",
     "Recorder": "recorder", "from_data": "formats", "from_file": "files",
+    "rooms_from_file": "files",
 }  # fmt: skip
 
 

@@ -98,6 +98,53 @@ def _read_line(line: str, label_map: LabelMap | None) -> SceneFields:
     return from_data(_parsed(line), label_map)
 
 
+def rooms_from_file(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read a file with the rooms of a home. Return the fields of a `where` request without a label.
+
+    ``client.where("medicine", **rooms_from_file("home.json"))`` asks about the rooms.
+
+    Args:
+        path: name of a JSON file, or ``-`` for standard input. It contains a request; or its rooms,
+            as a list or as a mapping from their names to their objects.
+
+    Raises:
+        MessageError: the file cannot be read, or it does not contain rooms.
+    """
+    name = os.fspath(path)
+    try:
+        return rooms_from_data(_parsed(_text(_bytes(name))))
+    except MessageError as error:
+        text = str(error)
+        raise MessageError(text if text.startswith(name) else f"{name}: {text}") from None
+
+
+def rooms_from_data(data: Any) -> dict[str, Any]:
+    """Return the fields of a `where` request without a label; see `rooms_from_file`.
+
+    Raises:
+        MessageError: the data does not contain rooms.
+    """
+    if isinstance(data, dict) and "rooms" in data:
+        fields = {name: value for name, value in data.items() if name != "label"}
+    else:
+        fields = {"rooms": data}
+    rooms = fields["rooms"]
+    if isinstance(rooms, dict):
+        rooms = [_room(name, content) for name, content in rooms.items()]
+    if not isinstance(rooms, list) or not all(isinstance(room, dict) for room in rooms):
+        raise MessageError(
+            "this has no rooms: it must be a request of /where, a list of its rooms, or a JSON "
+            'object such as {"kitchen": ["fridge", "stove"]}'
+        )
+    return fields | {"rooms": rooms}
+
+
+def _room(name: str, content: Any) -> Any:
+    if isinstance(content, list):
+        return {"id": name, "objects": content}
+    return {"id": name, **content} if isinstance(content, dict) else content
+
+
 def label_map_of(option: str) -> dict[str, str | None]:
     """Return the labels of the class ids that a name, or the name of a file, stands for.
 
