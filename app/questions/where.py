@@ -311,7 +311,7 @@ _EXAMPLES: Final = {
         },
     ),
     "listed": Example("the robot has seen such a thing", {**_HOME, "label": "pillow"}),
-    "unknown-labels": Example(
+    "unknown-thing": Example(
         "a thing that the model does not know", {**_HOME, "label": "lammp"}, "unknown-labels"
     ),
     "invalid-request": Example(
