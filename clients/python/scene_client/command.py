@@ -368,10 +368,12 @@ def where(
     file: Annotated[
         str,
         typer.Argument(
+            metavar="FILE | -",
             help="JSON file with the rooms of the home, or - for standard input: a request, a list "
             'of rooms, or an object such as {"kitchen": ["fridge", "stove"]}.',
+            show_default=False,
         ),
-    ],
+    ] = "",
     searched: Annotated[
         list[str] | None,
         typer.Option(
@@ -384,6 +386,8 @@ def where(
     unknown_labels: Unknown = None,
 ) -> None:
     """List the likely rooms and places of one thing in a home."""
+    if not file:
+        _fail("the rooms are missing: give a JSON file, or - for stdin")
     try:
         fields = rooms_from_file(file)
     except MessageError as error:
