@@ -1,4 +1,4 @@
-"""Ask the five questions about labels and positions, and branch on errors."""
+"""Ask the six questions about labels and positions, and branch on errors."""
 
 from __future__ import annotations
 
@@ -17,6 +17,11 @@ ROOM = {
     "objects": [DESK, LAMP, "moniter", "keyboard", "qwzx", "toilet"],
     "unknown_labels": "nearest-or-ignore",
 }
+# The rooms of a home, for the question where a thing is.
+HOME = [
+    {"id": "office", "objects": [DESK, LAMP, "monitor"]},
+    {"id": "bathroom", "objects": ["toilet", {"id": "sink_1", "label": "sink"}]},
+]
 
 
 def ask(scene: Client) -> None:
@@ -33,6 +38,9 @@ def ask(scene: Client) -> None:
     print("room:", room.room_type)
     (drawn,) = scene.generate(**ROOM, seed=7).scenes
     print("a whole room:", drawn.objects)
+    searched = [{"room": "bathroom", "object": "sink_1"}]  # the robot has looked there
+    (place,) = scene.where("toothbrush", HOME, searched=searched, top_k=1).places
+    print("the toothbrush:", place.room, place.relation, place.object)
 
 
 def main() -> int:
