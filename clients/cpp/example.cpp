@@ -71,7 +71,9 @@ int main(int argc, char** argv) {
     }
 
     std::cout << "Which room it is:\n";
-    const json rooms = service.rooms({{"objects", room["objects"]}, {"top_k", 3}});
+    question = {{"objects", room["objects"]}, {"top_k", 3}};
+    question["unknown_labels"] = "by-meaning";
+    const json rooms = service.rooms(question);
     for (const auto& entry : rooms["room_types"])
       std::cout << "  " << entry["room_type"].get<std::string>() << " " << entry["probability"]
                 << "\n";
@@ -80,6 +82,7 @@ int main(int argc, char** argv) {
     const json bedroom = {{"id", "bedroom"}, {"objects", room["objects"]}};
     const json kitchen = {{"id", "kitchen"}, {"objects", {"fridge", "stove", "counter"}}};
     question = {{"label", "phone"}, {"rooms", {bedroom, kitchen}}, {"top_k", 3}};
+    question["unknown_labels"] = "by-meaning";
     question["searched"] = json::array({{{"room", "kitchen"}, {"object", "counter"}}});
     const json places = service.where(question);
     for (const auto& place : places["places"]) {
