@@ -39,8 +39,8 @@ def ask(scene: Client) -> None:
     (drawn,) = scene.generate(**ROOM, seed=7).scenes
     print("a whole room:", drawn.objects)
     searched = [{"room": "bathroom", "object": "sink_1"}]  # the robot has looked there
-    (place,) = scene.where("toothbrush", HOME, searched=searched, top_k=1).places
-    print("the toothbrush:", place.room, place.relation, place.object)
+    rooms = scene.where("toothbrush", HOME, searched=searched).rooms
+    print("the toothbrush:", ", ".join(f"{one.room} {one.probability:.2f}" for one in rooms))
 
 
 def main() -> int:
