@@ -113,6 +113,8 @@ class SceneModel:
     @cached_property
     def room_prior(self) -> Float[NDArray[np.float64], "C"]:
         """log p(t) of each room type t in a scene without objects."""
+        if not self.spec.C:
+            return np.zeros(0)
         c1, nothing = self.weights["c1"], np.zeros(0, np.int64)
         return self.objects.room_log_p(c1[None], nothing, np.zeros((1, 0), np.float32), None)[0]
 
@@ -122,6 +124,8 @@ class SceneModel:
 
         p(t | i) is the probability of room type t given a scene of class i alone.
         """
+        if not self.spec.C:
+            return np.zeros((self.spec.V, 0), np.float32)
         V, one = self.spec.V, np.ones((1, 1), np.float32)
         c1, W, objects = self.weights["c1"], self.weights["W"], self.objects
         alone = [

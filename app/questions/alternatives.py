@@ -89,6 +89,11 @@ def label_probabilities(
     return {row: softmax(values) for row, values in by_object}
 
 
+def warm_up(model: SceneModel, scene: Scene) -> None:
+    """Compile the loops of a decision among labels, with a scene of at least one object."""
+    label_probabilities(model, scene, {0: Guesses(["", ""], [0, model.spec.V - 1], [0.5, 0.4])})
+
+
 def label_log_odds(
     model: SceneModel, scene: Scene, guesses: Mapping[int, Guesses]
 ) -> tuple[Float[Floats, "labels"], Float[Floats, "labels"]]:

@@ -48,7 +48,7 @@ from app.model.possibility import IN, ON, OVER, PRIOR_SHARE, UNDER, known_share
 from app.model.scene_model import SceneModel
 from app.model.statistics import Places
 from app.questions.answer import Fields, significant
-from app.questions.doubt import LEAST_REAL, Doubt
+from app.questions.doubt import LEAST_REAL
 from app.questions.posterior import Posterior
 from app.questions.standing import (
     FLOATS,
@@ -326,7 +326,11 @@ def _judged(model: SceneModel, entries: Entries) -> Iterator[tuple[Judgement, In
 
 
 def misplaced_fields(
-    model: SceneModel, posterior: Posterior, scene: Scene, sensitivity: Sensitivity, about: Doubt
+    model: SceneModel,
+    posterior: Posterior,
+    scene: Scene,
+    sensitivity: Sensitivity,
+    real: Float[NDArray[np.floating], "N"],  # probability of each object, see `doubt`
 ) -> list[Fields]:
     """Judge the stated relations, or the places of boxes.
 
@@ -350,7 +354,7 @@ def misplaced_fields(
     order = np.argsort(-log_odds, kind="stable")
     order = order[(is_relation | (p >= np.minimum(line, LEAST_LISTED)))[order]]
     ids = [thing.id for thing in scene.objects]
-    is_misplaced = (p >= line) & (about.real[entries.mover] >= LEAST_REAL)
+    is_misplaced = (p >= line) & (real[entries.mover] >= LEAST_REAL)
     columns = (
         *(entries.triple[order].tolist(), entries.kind[order].tolist()),
         *(significant(p[order]), is_misplaced[order].tolist(), entries.mover[order].tolist()),

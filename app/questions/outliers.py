@@ -85,7 +85,7 @@ def outliers(
     if posterior is not None:
         log_odds, change = posterior.given_rest(explained=details)
         about = doubt(model, posterior, log_odds)
-        wrong = misplaced_fields(model, posterior, scene, sensitivity, about)
+        wrong = misplaced_fields(model, posterior, scene, sensitivity, about.real)
         if model.calibration.outlier is not None and threshold is not None:
             changes = change if details else None
             judged, silent = _judged(model, posterior, scene, about, changes, threshold, can_alarm)
@@ -174,7 +174,7 @@ def misplaced(
         return []
     posterior = Posterior(model, scene)
     about = doubt(model, posterior, posterior.given_rest()[0])
-    return misplaced_fields(model, posterior, scene, sensitivity, about)
+    return misplaced_fields(model, posterior, scene, sensitivity, about.real)
 
 
 def intruders(model: SceneModel, scene: Scene) -> NDArray[np.int64]:

@@ -2,7 +2,8 @@
 
 r_it = `SHARPNESS` (log p(t | i) - log p(t)) is the evidence of class i for room type t, where
 p(t | i) is the probability of the room type given a scene of this class alone. The listed classes
-are from one room with the log evidence max_t sum_i r_it, or from K rooms of the types T with
+are from one room with the log evidence max_t sum_i r_it, or from K rooms of the types T, which may
+repeat, with
 
     sum_i log (1 / K) sum_{t in T} exp(r_it)
 
@@ -46,7 +47,7 @@ _MESSAGE: Final = (
 def several_rooms(model: SceneModel, scene: Scene) -> list[SceneWarning]:
     """Return the warning about a scene from several rooms, or no warning."""
     least, vocabulary = model.calibration.several_rooms, model.vocabulary
-    if least is None or len(scene.objects) < LEAST_CLASSES:
+    if least is None or model.spec.C < 2 or len(scene.objects) < LEAST_CLASSES:
         return []
     indices = [-1 if thing.class_index is None else thing.class_index for thing in scene.objects]
     rows = vocabulary.stand_in[indices]
@@ -67,6 +68,12 @@ def several_rooms(model: SceneModel, scene: Scene) -> list[SceneWarning]:
         return []
     message = _MESSAGE.format(number=len(rooms), names=", ".join(one.room_type for one in rooms))
     return [SceneWarning(code="several-rooms", message=message, objects=[], rooms=rooms)]
+
+
+def warm_up(model: SceneModel) -> None:
+    """Compute the evidence of a model, and compile the loop."""
+    if model.spec.C:
+        gain(model.room_evidence, model.room_odds, np.zeros(1, np.int64), 0.0)
 
 
 @compiled

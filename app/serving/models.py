@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import Final, Self
 
 from app import errors
-from app.questions import QUESTIONS, conventions
+from app.questions import QUESTIONS, alternatives, conventions, several_rooms
 from app.questions.answer import written
 from app.registry import Artifact, ArtifactError, ModelSet, StoreError
 from app.registry.model_set import EMPTY
@@ -187,6 +187,8 @@ def warm_up(artifact: Artifact) -> None:
     try:
         stands = None if model.places is None else model.places.stands
         conventions.warm_up(model.vocabulary, stands)
+        several_rooms.warm_up(model)
+        alternatives.warm_up(model, bare)
         for question in QUESTIONS:
             for answer in question.warm_up(model, (related, bare, posed)):
                 written(answer)

@@ -42,6 +42,8 @@ def lines(low: float, medium: float, high: float, log_count: float = 0.0) -> Ala
 
 
 NO_ALARM = lines(1e3, 1e3, 1e3)
+DOUBTING = CountSlope(slope=-1.0)
+"""Every unlikely object is a probable intruder."""
 
 
 def judging(lines: AlarmLines = NO_ALARM, stand: float = 0.0, **changes: object) -> Misplaced:
@@ -52,8 +54,12 @@ def judging(lines: AlarmLines = NO_ALARM, stand: float = 0.0, **changes: object)
 
 
 def calibration(relations: int, **changes: object) -> Calibration:
-    """A neutral calibration without outliers, so every generated scene is plausible."""
-    judged = {"outlier": CountSlope(slope=-1.0), "outlier_lines": NO_ALARM, "misplaced": judging()}
+    """A neutral calibration without outliers, so every generated scene is plausible.
+
+    No object is doubtful: the log-odds of an intruder are below -100.
+    """
+    outlier = CountSlope(intercept=-200.0, slope=-1.0)
+    judged = {"outlier": outlier, "outlier_lines": NO_ALARM, "misplaced": judging()}
     return Calibration(**{**dict(Calibration.neutral(relations)), **judged, **changes})
 
 

@@ -1,7 +1,7 @@
 """Answers to the scoring questions, compared with the enumerated joint of a small machine."""
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
 
@@ -18,7 +18,14 @@ from tests.enumeration.small_machines import (
     relation_by_definition,
 )
 from tests.questions.answers import disagreements, missing, outliers, relations
-from tests.questions.artifacts import EXACT, LABELS, artifact_of, random_machine, scene_of
+from tests.questions.artifacts import (
+    DOUBTING,
+    EXACT,
+    LABELS,
+    artifact_of,
+    random_machine,
+    scene_of,
+)
 
 pytestmark = pytest.mark.usefixtures("without_minimums")
 
@@ -149,6 +156,8 @@ def test_missing(name, room, profile, coverage):
 def test_outliers(name, room, profile):
     """All classes but one are listed, so the last row of kappa counts."""
     artifact, exact = exact_case(name, room=room, profile=profile)
+    calibration = artifact.calibration.model_copy(update={"outlier": DOUBTING})
+    artifact = replace(artifact, calibration=calibration)
     for classes, stated in SCENES:
         scene = scene_of(classes, stated, room, profile=profile)
         entries = outliers(artifact, scene).outliers

@@ -406,7 +406,8 @@ def test_without_places_stated_supports_have_no_stand_and_boxes_no_entry():
     scene = stated([DESK, MONITOR], [(ON_TOP, 1, 0)])
     table = entries(scene, {(ON_TOP, 1, 0): 1.5}, artifact=artifact)
     assert table == {(ON_TOP, 1, 0): (SUPPORT, [1.5, 0.0, 0.0, 0.0, 0.0], 1)}
-    (entry,) = misplaced_fields(artifact, posterior_of(scene), scene, "medium")
+    posterior = posterior_of(scene)
+    (entry,) = misplaced_fields(artifact, posterior, scene, "medium", np.ones(len(scene.objects)))
     assert (entry["subject"], entry["moved"]) == ("monitor", "monitor")
     boxes = posed((DESK, (0, 0, 0)), (MONITOR, (0, 0, 0.75)), artifact=artifact)
     assert not entries_of(artifact, posterior_of(boxes), boxes).kind.size
@@ -421,7 +422,8 @@ EVERY = judging(lines(-99.0, -99.0, -99.0), stand=-1.0)
 def fields_of(scene, alone=(), sensitivity="medium", judgements=JUDGED):
     calibration = ARTIFACT.calibration.model_copy(update={"misplaced": judgements})
     artifact = replace(ARTIFACT, calibration=calibration)
-    return misplaced_fields(artifact, posterior_of(scene, alone), scene, sensitivity)
+    posterior = posterior_of(scene, alone)
+    return misplaced_fields(artifact, posterior, scene, sensitivity, np.ones(len(scene.objects)))
 
 
 def test_the_log_odds_are_a_weighted_sum_of_the_terms():

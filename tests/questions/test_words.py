@@ -14,7 +14,7 @@ from app.questions.relations import relations
 from app.questions.rooms import rooms
 from app.scene import ObjectClass, RelationTable, Scene, SceneObject, Vocabulary
 from app.scene.vocabulary import Word
-from tests.questions.artifacts import LABELS, LARGER, larger_artifact, lines
+from tests.questions.artifacts import DOUBTING, LABELS, LARGER, larger_artifact, lines
 
 ALARM = lines(-1e3, -1e3, -1e3)
 CLASSES = larger_artifact("triway").vocabulary
@@ -91,7 +91,7 @@ def test_relations_and_places_are_those_of_the_nearest_class(variant) -> None:
 
 def test_a_word_never_is_an_outlier(variant) -> None:
     """Not even where every known object is, or where the request states a threshold."""
-    artifact = open_artifact(variant, "ottoman", outlier_lines=ALARM)
+    artifact = open_artifact(variant, "ottoman", outlier=DOUBTING, outlier_lines=ALARM)
     scene = Scene(objects(artifact, "bed", "ottoman", "lamp"))
     for options in ({}, {"threshold": 0.0}, {"sensitivity": "high"}):
         answer = outliers(artifact, scene, **options)

@@ -14,30 +14,34 @@ if TYPE_CHECKING:
         AnswerError,
         ClientError,
         DeadlineError,
+        HomeFileError,
         InvalidRequestError,
         ProblemError,
         UnreachableError,
     )
     from scene_client.files import from_file, rooms_from_file
     from scene_client.formats import from_data
+    from scene_client.home import Home
+    from scene_client.home_state import Event
     from scene_client.offline import OfflineClient
     from scene_client.recorder import Recorder
     from scene_client.sync import Client
+    from scene_client.tracks import Settings
 
 __version__ = "2.0.0"
 
 __all__ = [
-    "AnswerError", "AsyncClient", "Client", "ClientError", "DeadlineError", "InvalidRequestError",
-    "OfflineClient", "ProblemError", "Recorder", "UnreachableError", "from_data", "from_file",
-    "rooms_from_file",
+    "AnswerError", "AsyncClient", "Client", "ClientError", "DeadlineError", "Event", "Home",
+    "HomeFileError", "InvalidRequestError", "OfflineClient", "ProblemError", "Recorder", "Settings",
+    "UnreachableError", "from_data", "from_file", "rooms_from_file",
 ]  # fmt: skip
 
 # Maps each name to the module that defines the name. The package imports the module on first use of
 # the name. So the service, which needs only the schemas, starts without httpx.
 _MODULES = {
-    "AsyncClient": "asynchronous", "Client": "sync", "OfflineClient": "offline",
-    "Recorder": "recorder", "from_data": "formats", "from_file": "files",
-    "rooms_from_file": "files",
+    "AsyncClient": "asynchronous", "Client": "sync", "Event": "home_state", "Home": "home",
+    "OfflineClient": "offline", "Recorder": "recorder", "Settings": "tracks",
+    "from_data": "formats", "from_file": "files", "rooms_from_file": "files",
 }  # fmt: skip
 
 

@@ -110,6 +110,10 @@ class AnswerError(ClientError):
     """The client cannot read the answer of the service."""
 
 
+class HomeFileError(ClientError, ValueError):
+    """The file of a home is damaged, or a newer client has written it. It is left as it is."""
+
+
 def problem_of(
     status: int, headers: Mapping[str, str], body: bytes, request: str | None = None
 ) -> ProblemError:

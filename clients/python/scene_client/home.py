@@ -1,0 +1,399 @@
+"""What a moving robot knows about a home, between a detector and questions (docs/moving.md)."""
+
+from __future__ import annotations
+
+import atexit
+import logging
+import math
+import os
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, cast
+
+from typing_extensions import Self
+
+from scene_client import schemas
+from scene_client.errors import ClientError, InvalidRequestError
+from scene_client.home_state import Event, Kind, Room, State, inside, read_state, write_state
+from scene_client.recorder import Recorder
+from scene_client.tracks import (
+    Frame,
+    Latch,
+    Point,
+    Settings,
+    Track,
+    Tracks,
+    Vector,
+    minus,
+    plus,
+    read_detections,
+)
+
+if TYPE_CHECKING:
+    from scene_client.sync import Client
+
+EDGE: Final = 0.2  # metres outside of a room until a thing, or the robot, has left it
+NEAR: Final = 5.0  # metres around the robot; without rooms, the things within are its room
+LIKELY: Final = 0.2  # probability of existence from which a thing is evidence for the room type
+MARGIN: Final = 0.1  # difference of probabilities from which another room type is likelier
+LOST_TIMEOUT: Final = 0.3  # seconds of a try while the service is lost
+FIRST_PAUSE, LONGEST_PAUSE = 2.0, 30.0  # seconds between tries; the pause doubles each time
+UNKNOWN: Final = "nearest-or-ignore"
+
+_logger: Final = logging.getLogger(__name__)
+
+
+class Home:
+    """State between a detector and the questions about the rooms of a home, for one thread.
+
+    Args:
+        client: client of the service.
+        rooms: polygon of each room in the frame ``map``, by name. Without polygons, the argument
+            ``room`` of `update` names the room.
+        path: file of the home. If it exists, the home resumes from it.
+        view: full horizontal angle of the camera in radians, and its reach in metres.
+        room_candidates: possible room types of the rooms whose name is no room type.
+        record: file ``*.jsonl`` for confirmed scenes, as ``training adapt`` reads them.
+        settings: the settings.
+
+    Raises:
+        HomeFileError: the file is damaged, or of a newer version.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        rooms: Mapping[str, Sequence[Point]] | None = None,
+        *,
+        path: str | os.PathLike[str] | None = None,
+        view: Point | None = None,
+        room_candidates: Iterable[str] = (),
+        record: str | os.PathLike[str] | None = None,
+        settings: Settings | None = None,
+    ) -> None:
+        self.client, self.view, self.settings = client, view, settings or Settings()
+        self.path = None if path is None else Path(path)
+        self.room = ""  # of the robot
+        self.matched: list[str] = []  # track of each detection of the last frame
+        self.confirmed: set[tuple[str, str]] = set()  # habits: label and room
+        self._polygons, self._candidates = dict(rooms or {}), list(room_candidates)
+        self._recorder = None if record is None else Recorder(record)
+        self._rooms = {name: Room() for name in self._polygons}
+        self._tracks = Tracks(self.settings, self._room_of)
+        self._pose: Vector | None = None
+        self._now = self._saved = self._next = -math.inf
+        self._asked: dict[str, dict[str, tuple[str, float, Vector | None]]] = {}
+        self._lost: float | None = None  # seconds until the next try
+        if self.path is not None:
+            self._resume(read_state(self.path))
+            atexit.register(self.close)
+
+    # ---------------------------------------------------------------------------------- a frame
+
+    def update(
+        self,
+        detections: Iterable[str | schemas.Detection | schemas.Body],
+        pose: Sequence[float] | Mapping[str, float] | None = None,
+        stamp: float | schemas.Stamp | schemas.Body | None = None,
+        *,
+        room: str | None = None,
+        view: Point | None = None,
+    ) -> list[Event]:
+        """Take the detections of one frame, also of an empty one. Return what has changed.
+
+        Positions and the `pose` (x, y, yaw) are in the frame ``map``. `stamp` is in seconds; the
+        default is the clock of the computer. `room` is the robot's room; the default is the polygon
+        with the robot. `view` replaces that of the home. Invalid detections raise an
+        `InvalidRequestError`.
+        """
+        seen = read_detections(detections)
+        if (now := _seconds(stamp)) < self._now:  # a recording starts again
+            self._saved = self._next = self._now = now
+        elapsed, self._now = now - self._now, now
+        self._tracks.follow_jump(seen)
+        self._pose = None if pose is None else minus(_pose(pose), self._tracks.shift)
+        if room is None and self._pose is not None and self._polygons:
+            room = self._room_of(self._pose, self.room) or self.room
+        self.room = room or ""
+        weight = min(1.0, elapsed / self.settings.look)
+        self._rooms.setdefault(self.room, Room()).look(self._pose, weight)
+        frame = Frame(seen, now, weight, self._pose, view or self.view, self.room)
+        tracks, appeared, gone = self._tracks.update(frame)
+        self.matched = [one.id for one in tracks]
+        events = [self._event("appeared", one, one.first) for one in appeared]
+        events += [self._event("gone", one, one.last) for one in gone]
+        events += self._ask()
+        if self._lost is None:
+            events += [*self._alarms(tracks, elapsed), *self._settle(elapsed)]
+        if self.path is not None and now - self._saved >= self.settings.save_every:
+            self._try_save()
+        return events
+
+    def _room_of(self, place: Vector, room: str) -> str:
+        """Return the room of a place. At its edges, a thing or a robot stays in its `room`."""
+        (x, y, _), polygon = place, self._polygons.get(room, ())
+        around = ((x, y), (x - EDGE, y), (x + EDGE, y), (x, y - EDGE), (x, y + EDGE))
+        if not self._polygons:
+            return self.room
+        if any(inside(*at, polygon) for at in around):
+            return room
+        return next((one for one, edge in self._polygons.items() if inside(x, y, edge)), "")
+
+    def _alarms(self, seen: Iterable[Track], elapsed: float) -> Iterator[Event]:
+        """Count the verdicts about the seen things. Alarms of unseen things stay as they are."""
+        step = self._step(elapsed, self.settings.hold)
+        for track in seen:
+            verdict, former = None if self._is_habit(track) else track.verdict, track.alarm.value
+            if track.is_confirmed and track.alarm.update(verdict, self._now, step):
+                yield self._event(
+                    cast(Kind, verdict or "cleared"), track, track.alarm.since, former
+                )
+
+    def _settle(self, elapsed: float) -> Iterator[Event]:
+        """Count the answer about the type of the robot's room, in proportion to its probability."""
+        room = self._rooms[self.room]
+        former, step = room.type.value, self._step(elapsed, self.settings.room_hold)
+        best = None if room.is_named else room.best
+        if best and room.type.update(best, self._now, room.probability * step):
+            yield Event(
+                "room", self._now, room.type.since, label=best, room=self.room,
+                probability=room.probability, detail=former,
+            )  # fmt: skip
+
+    def _step(self, elapsed: float, hold: float) -> float:
+        # One look counts at most a second, because a pause says nothing about the answer.
+        looks = min(1.0, elapsed / self.settings.look)
+        return min(min(1.0, elapsed) / hold, looks / self.settings.answers)
+
+    def _event(self, kind: Kind, one: Track, since: float, detail: str | None = None) -> Event:
+        return Event(kind, self._now, since, one.id, one.label, one.room, one.probability, detail)
+
+    def _is_habit(self, track: Track) -> bool:
+        return (track.label, track.room) in self.confirmed
+
+    # -------------------------------------------------------------------------------- questions
+
+    def _ask(self) -> Iterator[Event]:
+        """Ask about the room of the robot if its things have changed, or its type is open."""
+        if self._now < self._next:
+            return
+        things, room = self._things(self.room), self._rooms[self.room]
+        is_new = self._lost is not None or self._has_changed(things)
+        is_open = room.is_named is not True and (is_new or room.type.value is None)
+        timeout = self.settings.timeout if self._lost is None else LOST_TIMEOUT
+        try:
+            if is_open and (likely := self._things(self.room, LIKELY)):
+                self._ask_type(room, likely, timeout)
+            if is_new and things:
+                self._ask_outliers(room, things, timeout)
+        except InvalidRequestError:
+            raise
+        except ClientError as error:
+            if self._lost is None:
+                yield Event("service", self._now, self._now, label="lost", detail=str(error))
+            pause = FIRST_PAUSE if self._lost is None else min(LONGEST_PAUSE, 2 * self._lost)
+            self._lost, self._next = pause, self._now + pause
+            return
+        if self._lost is not None and things:
+            self._lost = None
+            yield Event("service", self._now, self._now, label="back")
+        self._next = self._now + self.settings.pause
+
+    def _has_changed(self, things: list[Track]) -> bool:
+        step, asked = self.settings.step, self._asked.get(self.room, {})
+        if asked.keys() != {one.id for one in things}:
+            return True
+        for one in things:
+            label, confidence, place = asked[one.id]
+            has_moved = place and one.place and math.dist(place, one.place) > step
+            if label != one.label or abs(confidence - one.confidence) > step or has_moved:
+                return True
+        return False
+
+    def _ask_type(self, room: Room, things: list[Track], timeout: float) -> None:
+        objects = [one.as_object(self._tracks.shift) for one in things]
+        fields: Any = {"candidates": self._candidates} if self._candidates else {}
+        answer = self.client.rooms(
+            objects, unknown_labels=UNKNOWN, detail="scores", timeout=timeout, **fields
+        )
+        types = {one.room_type: one.probability for one in answer.room_types}
+        best = max(types, key=types.__getitem__, default=None)
+        if best is not None and types[best] - types.get(room.best or "", 0.0) > MARGIN:
+            room.best = best
+        room.probability = types.get(room.best or "", 0.0)
+
+    def _ask_outliers(self, room: Room, things: list[Track], timeout: float) -> None:
+        scene = self._scene(things, self.room) | {"sensitivity": self.settings.sensitivity}
+        answer = self.client.outliers(**scene, timeout=timeout)
+        if "room_type" in scene and room.is_named is None:
+            guessed = [one.label for one in answer.mapped if one.similarity < 1]
+            room.is_named = self.room not in (*answer.ignored, *guessed)
+        self._asked[self.room] = {one.id: (one.label, one.confidence, one.place) for one in things}
+        moved = {one.moved or one.subject: one for one in answer.misplaced if one.is_misplaced}
+        for one in answer.outliers:
+            if (track := self._tracks.all.get(one.object)) is None:
+                continue
+            track.verdict, track.probability = None, one.probability
+            if one.is_outlier:
+                track.verdict = "out-of-place"
+            elif one.object in moved:
+                track.verdict, track.probability = "misplaced", moved[one.object].probability
+            elif one.reason == "misdetection":
+                track.verdict, track.probability = "misdetection", 1 - one.real
+
+    @property
+    def alarms(self) -> list[Event]:
+        """The alarms that are on."""
+        return [
+            self._event(cast(Kind, one.alarm.value), one, one.alarm.since)
+            for one in self._tracks.all.values()
+            if one.alarm.value is not None
+        ]
+
+    def things(self, room: str | None = None) -> list[Track]:
+        """Return the present things of a room, by default of the whole home."""
+        present = [one for one in self._tracks.all.values() if one.is_confirmed]
+        return present if room is None else [one for one in present if one.room == room]
+
+    def room_type(self, room: str | None = None) -> str | None:
+        """Return the type of a room, by default of the robot's room, or else the likeliest one."""
+        name = self.room if room is None else room
+        return self._settled_type(name) or self._rooms.get(name, Room()).best
+
+    def _settled_type(self, name: str) -> str | None:
+        room = self._rooms.get(name, Room())
+        return name if room.is_named else room.type.value
+
+    def coverage(self, room: str | None = None) -> float:
+        """Return the share of a room that the robot has seen, from .2 at first sight to .9."""
+        return self._rooms.get(self.room if room is None else room, Room()).coverage
+
+    def scene(self, room: str | None = None) -> dict[str, Any]:
+        """Return the fields of a request about a room, by default about the robot's room."""
+        name = self.room if room is None else room
+        return self._scene(self._things(name), name)
+
+    def _scene(self, things: Iterable[Track], room: str) -> dict[str, Any]:
+        objects = [one.as_object(self._tracks.shift) for one in things]
+        scene: dict[str, Any] = {"objects": objects, "unknown_labels": UNKNOWN}
+        if any("position" in one for one in objects):
+            scene["frame_id"] = "map"
+            if self._pose is not None:
+                at = plus(self._pose, self._tracks.shift)
+                scene["viewpoint"] = dict(zip(("x", "y", "yaw"), at, strict=True))
+        if room and self._rooms.get(room, Room()).is_named is not False:
+            scene["room_type"] = room
+        return scene
+
+    def _things(self, room: str, exists: float | None = None) -> list[Track]:
+        """Return the most certain (present) things of a room, or without rooms of those nearby."""
+        here = None if room else self._pose
+        found = [
+            one
+            for one in self._tracks.all.values()
+            if one.room == room
+            and (one.is_confirmed if exists is None else one.exists >= exists)
+            and (not here or not one.place or math.dist(one.place[:2], here[:2]) <= NEAR)
+        ]
+        return sorted(found, key=lambda one: -one.confidence)[:256]
+
+    def missing(self, room: str | None = None, **fields: Any) -> schemas.MissingAnswer:
+        """Ask which things a room lacks. Other fields are those of `Client.missing`."""
+        scene = {**self.scene(room), "coverage": self.coverage(room)}
+        return self.client.missing(**{**scene, **fields})
+
+    def where(
+        self, label: str, searched: Iterable[schemas.Searched | schemas.Body] = (), **fields: Any
+    ) -> schemas.WhereAnswer:
+        """Ask where in the home a thing is. Other fields are those of `Client.where`."""
+        rooms, common = [], {"searched": list(searched), "unknown_labels": UNKNOWN}
+        for name in self._rooms:
+            if not (things := self._things(name)) and not name:
+                continue
+            scene = self._scene(things, name)
+            room = {"id": name or "here", "objects": scene["objects"]}
+            if (kind := self._settled_type(name)) is not None:
+                room["room_type"] = kind
+            rooms.append(room | {"coverage": self._rooms[name].coverage})
+            common |= {one: scene[one] for one in ("frame_id", "viewpoint") if one in scene}
+        return self.client.where(label, rooms, **{**common, **fields})
+
+    def confirm(self, track_id: str) -> list[Event]:
+        """State that a thing belongs where it is. Return the alarms that this clears.
+
+        Things of this label in this room raise no alarm from now on. With ``record``, the scene of
+        the room is recorded as confirmed, without the things of other alarms.
+
+        Raises:
+            KeyError: the home has no such thing.
+        """
+        track, events = self._tracks.all[track_id], []
+        self.confirmed.add((track.label, track.room))
+        for one in self._tracks.all.values():
+            if self._is_habit(one) and one.alarm.value is not None:
+                former, one.alarm = one.alarm.value, Latch()
+                events.append(self._event("cleared", one, self._now, former))
+        if self._recorder is not None:
+            quiet = [one for one in self._things(track.room) if one.alarm.value is None]
+            kind = self._settled_type(track.room)
+            scene = self._scene(quiet, track.room) | {"confirmed": True, "room_type": kind}
+            self._recorder.confirm(schemas.SceneRequest.model_validate(scene))
+        return events
+
+    # --------------------------------------------------------------------------------- the file
+
+    def save(self, path: str | os.PathLike[str] | None = None) -> None:
+        """Write the home to a file, by default to its own. A crash leaves the old file.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        if (target := path or self.path) is None:
+            raise ValueError("the home has no file: name a path")
+        now, tracks = self._now if math.isfinite(self._now) else None, self._tracks
+        state = State(
+            now, self.room, tracks.shift, tracks.count, self.confirmed, self._rooms, tracks.all
+        )
+        write_state(state, Path(target))
+
+    def _resume(self, state: State) -> None:
+        self.room, self.confirmed = state.room, state.habits
+        self._tracks.shift, self._tracks.count = state.shift, state.count
+        self._rooms |= state.rooms
+        for track in state.tracks.values():
+            self._tracks.add(track)
+        self._now = self._saved = -math.inf if state.stamp is None else state.stamp
+
+    def _try_save(self) -> None:
+        self._saved = self._now
+        try:
+            self.save()
+        except OSError as error:
+            _logger.warning("cannot save the home in %s: %s", self.path, error)
+
+    def close(self) -> None:
+        """Save the home to its file. The end of the program does so too."""
+        if self.path is not None:
+            atexit.unregister(self.close)
+            self._try_save()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _pose(values: Sequence[float] | Mapping[str, float]) -> Vector:
+    x, y, yaw = [values[n] for n in ("x", "y", "yaw")] if isinstance(values, Mapping) else values
+    return float(x), float(y), float(yaw)
+
+
+def _seconds(stamp: float | schemas.Stamp | schemas.Body | None) -> float:
+    if stamp is None:
+        return time.time()
+    if isinstance(stamp, int | float):
+        return float(stamp)
+    whole = schemas.Stamp.model_validate(stamp, from_attributes=True)
+    return whole.sec + whole.nanosec * 1e-9

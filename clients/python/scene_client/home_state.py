@@ -1,0 +1,126 @@
+"""The events and rooms of a home, and the file from which it resumes after a restart."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final, Literal
+
+from pydantic import TypeAdapter
+
+from scene_client.errors import HomeFileError
+from scene_client.tracks import Latch, Point, Track, Vector
+
+VERSION: Final = 1  # of the file
+HEADINGS, LOOKS = 8, 30  # directions, or looks without poses, that show a whole room
+
+Kind = Literal[
+    "appeared", "gone", "out-of-place", "misplaced", "misdetection", "cleared", "room", "service"
+]
+
+
+@dataclass(frozen=True)
+class Event:
+    """One change of a home, or an alarm that is on."""
+
+    kind: Kind
+    stamp: float  # time of the change
+    since: float  # start of what the event reports
+    id: str | None = None  # track of the thing
+    label: str | None = None  # of the thing; type of the room; service `lost` or `back`
+    room: str = ""  # name of the room; empty without names
+    probability: float | None = None  # in the last answer
+    detail: str | None = None  # the former alarm or type; the error of the service
+
+
+@dataclass
+class Room:
+    """What a home knows about one room."""
+
+    type: Latch = field(default_factory=Latch)
+    best: str | None = None  # likeliest type in the last answer
+    probability: float = 0.0  # of this type
+    is_named: bool | None = None  # whether the name is a room type; None before the first answer
+    headings: set[int] = field(default_factory=set)  # directions of the looks
+    looks: float = 0.0  # number of looks without a pose
+
+    def look(self, pose: Vector | None, weight: float) -> None:
+        """Count a look."""
+        if pose is None:
+            self.looks += weight
+        else:
+            self.headings.add(math.floor(pose[2] / math.tau * HEADINGS) % HEADINGS)
+
+    @property
+    def coverage(self) -> float:
+        """Share of the room that the robot has seen."""
+        return 0.2 + 0.7 * min(1.0, max(len(self.headings) / HEADINGS, self.looks / LOOKS))
+
+
+def inside(x: float, y: float, polygon: Iterable[Point]) -> bool:
+    """Return whether a polygon contains a point (even-odd rule)."""
+    corners, odd = list(polygon), False
+    for (ax, ay), (bx, by) in zip(corners, corners[1:] + corners[:1], strict=True):
+        if (ay > y) != (by > y) and x < ax + (y - ay) * (bx - ax) / (by - ay):
+            odd = not odd
+    return odd
+
+
+@dataclass
+class State:
+    """The contents of the file of a home."""
+
+    stamp: float | None = None  # time of the last frame
+    room: str = ""  # room of the robot
+    shift: Vector = (0.0, 0.0, 0.0)  # of the map
+    count: int = 0  # number of all tracks, also of ended ones
+    habits: set[tuple[str, str]] = field(default_factory=set)  # label and room
+    rooms: dict[str, Room] = field(default_factory=dict)
+    tracks: dict[str, Track] = field(default_factory=dict)
+    format: Literal["scene-home"] = "scene-home"
+    version: int = VERSION
+
+
+def write_state(state: State, path: Path) -> None:
+    """Replace the file of a home. A reader, or a crash, never sees a part of it.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    sibling = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with sibling.open("wb") as file:
+            file.write(TypeAdapter(State).dump_json(state))
+            file.flush()
+            os.fsync(file.fileno())
+        sibling.replace(path)
+    finally:
+        sibling.unlink(missing_ok=True)
+
+
+def read_state(path: Path) -> State:
+    """Return the contents of the file of a home, or an empty state if there is no file.
+
+    Raises:
+        HomeFileError: the file is damaged, or of a newer version.
+    """
+    try:
+        text = path.read_bytes()
+        version = json.loads(text)["version"]
+        if version <= VERSION:
+            return TypeAdapter(State).validate_json(text)
+    except FileNotFoundError:
+        return State()
+    except (LookupError, OSError, TypeError, ValueError) as error:
+        raise HomeFileError(
+            f"{path} is not a whole file of a home ({type(error).__name__}: {error}). Restore it, "
+            "or name another file. It is left as it is."
+        ) from None
+    raise HomeFileError(
+        f"{path} has version {version}, but this client reads up to version {VERSION}. Install a "
+        "newer client, or name another file. It is left as it is."
+    )
