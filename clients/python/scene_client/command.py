@@ -25,6 +25,7 @@ from scene_client import __version__, tables
 from scene_client.errors import (
     ClientError,
     DeadlineError,
+    HomeFileError,
     InvalidRequestError,
     ProblemError,
     UnreachableError,
@@ -369,8 +370,8 @@ def where(
         str,
         typer.Argument(
             metavar="FILE | -",
-            help="JSON file with the rooms of the home, or - for standard input: a request, a list "
-            'of rooms, or an object such as {"kitchen": ["fridge", "stove"]}.',
+            help="JSON file with the rooms of the home, or - for standard input: the file of a "
+            'Home, a request, a list of rooms, or an object such as {"kitchen": ["fridge"]}.',
             show_default=False,
         ),
     ] = "",
@@ -390,7 +391,7 @@ def where(
         _fail("the rooms are missing: give a JSON file, or - for stdin")
     try:
         fields = rooms_from_file(file)
-    except MessageError as error:
+    except (MessageError, HomeFileError) as error:
         _fail(str(error))
     general: Options = context.obj
     places = [_search(text) for text in searched or ()]
