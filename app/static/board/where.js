@@ -223,9 +223,7 @@ export function createWhere(panel, store, say, go) {
     render(state, previous) {
       if (state.room !== previous.room) name.placeholder = state.room || 'kitchen';
       if (state.where.rooms !== previous.where.rooms) drawRooms(state);
-      const isNew = state.where.status !== 'asking' && changed(state, previous, 'where', 'things', 'line');
-      if (isNew) drawAnswer(state);
-      else if (state.where.status === 'asking') article.setAttribute('aria-busy', 'true');
+      if (changed(state, previous, 'where', 'things', 'line')) drawAnswer(state);
     },
   };
 }
