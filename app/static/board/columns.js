@@ -196,10 +196,11 @@ export function calls() {
   };
 }
 
-/** A problem document as text. Each error names its object of the request. */
+/** A problem document as text. Each error names its object, room or label of the request. */
 export function problemWords(problem, body) {
   const errors = (problem.errors ?? []).map(({ pointer, message, suggestions = [] }) => {
-    const about = body?.objects?.[/^#\/objects\/(\d+)/.exec(pointer)?.[1]]?.id;
+    const [, field, index] = /^#\/(objects|rooms|label)(?:\/(\d+))?/.exec(pointer) ?? [];
+    const about = field === 'label' ? body?.label : body?.[field]?.[index]?.id;
     return el('li', {}, `${about ? `${about}: ` : ''}${message}${suggestions.length ? ` (${suggestions.join(', ')}?)` : ''}`);
   });
   return [

@@ -179,7 +179,10 @@ const file = fileDialog(store, records, recorded, (scene, notes, line) => {
   put(scene, {}, line);
   if (notes) note(`${get('note').textContent} ${notes}`.trim());
   if (!store.get().down) get('banner').hidden = true; // such as that of a broken link
-}, say, (scenes) => where.useRooms(roomsOf(scenes, records)));
+}, say, (scenes, index, isNew) => {
+  if (isNew) where.useRooms(roomsOf(scenes, records));
+  where.placed(index);
+});
 watchService(store, get('banner'), () => void reload());
 
 /** Says whether the scene is confirmed, and how many confirmed scenes can be downloaded. */

@@ -87,7 +87,6 @@ export function createRecorded(store, records, go) {
   function habits(open) {
     const left = new Set(lines.flatMap((line, index) => openOf(index).map((one) => habit(one, records.current(line)))));
     const done = alarms.length === lines.length && !open && alarms.some((found) => found.length);
-    enough.hidden = !done;
     if (done && enough.textContent !== ENOUGH) enough.textContent = ENOUGH;
     else if (!done) enough.textContent = '';
     const all = covered.size + left.size;
@@ -106,7 +105,7 @@ export function createRecorded(store, records, go) {
     nextAlarm.textContent = `Next alarm (scene ${alarm + 1})`;
     const confirmed = several ? habits(open) : '';
     if (!several) {
-      enough.hidden = true;
+      enough.textContent = '';
       return;
     }
     const known = alarms.length < lines.length ? `${alarms.length} of ${lines.length} scenes asked. ` : '';

@@ -7,7 +7,7 @@ import { plain } from './words.js';
  * @property {string} name
  * @property {string} [room_type] if the name is none
  * @property {object[]} objects as in a request
- * @property {string} [scene_id] the scene of the objects
+ * @property {string} [scene_id] the scene on the board that has these objects
  * @property {number} [index] its number in the opened file
  */
 
@@ -26,9 +26,14 @@ export function thingAt({ room: name, object: id }, state) {
   return state.things.find((thing) => thing.id === id && thing.label === entry?.label);
 }
 
+const LEAST = 0.01;
+const FEWEST = 5;
+
+/** The places of at least 1 %, and the first ones. */
+export const placesOf = ({ answer }) => (answer?.places ?? []).filter(({ probability }, index) => index < FEWEST || probability >= LEAST);
+
 /** The ids of the objects of the board that are places of the thing. */
 export function spotsOf(state) {
-  const { answer } = state.where;
-  if (!answer || state.tab !== 'where' || state.draft) return new Set();
-  return new Set(answer.places.flatMap((place) => thingAt(place, state)?.id ?? []));
+  if (state.tab !== 'where' || state.draft) return new Set();
+  return new Set(placesOf(state.where).flatMap((place) => thingAt(place, state)?.id ?? []));
 }

@@ -7,7 +7,7 @@ import { el, redraw } from './dom.js';
 import { asRequest } from './importing.js';
 import { UNKNOWN_LABELS } from './questions.js';
 import { fromScene, SceneError, toScene } from './scene.js';
-import { nowhere, thingAt } from './spots.js';
+import { nowhere, placesOf, thingAt } from './spots.js';
 import { changed } from './store.js';
 import { namesOf, percent, plain, SPOKEN, wordOf } from './words.js';
 
@@ -69,10 +69,15 @@ export function createWhere(panel, store, say, go) {
     };
   }
 
+  /** The rooms, with the objects of the board in the room of its scene. */
+  const withBoard = ({ where: { rooms }, line, things }) => rooms.map((room) => (
+    room.index !== undefined && room.scene_id === line.scene_id ? { ...room, objects: objectsOf({ things }) } : room));
+
   async function ask() {
     controller.abort();
     controller = new AbortController();
     const { signal } = controller;
+    update({ rooms: withBoard(store.get()) });
     const state = store.get();
     if (!state.where.wanted || !state.where.rooms.length) {
       update({ answer: null, problem: null, status: 'none', body: null });
@@ -184,7 +189,7 @@ export function createWhere(panel, store, say, go) {
       answer?.listed_as ? `class: ${answer.label}.` : '', looks,
       rooms.length ? (status === 'down' ? 'Waiting for the service.' : '') : 'Add a room first.',
     ].filter(Boolean).join(' ');
-    redraw(own.places, (answer?.places ?? []).map((place) => placeRow(place, state)));
+    redraw(own.places, placesOf(state.where).map((place) => placeRow(place, state)));
     more.hidden = !answer;
     redraw(own.rooms, answer ? roomRows(answer) : []);
     own.calls.show('where', answer ? body : null);
@@ -214,6 +219,11 @@ export function createWhere(panel, store, say, go) {
   drawAnswer(store.get());
 
   return {
+    /** Notes that the board shows a scene of the opened file. */
+    placed(index) {
+      const { scene_id: id } = store.get().line;
+      update({ rooms: store.get().where.rooms.map((room) => (room.index === index ? { ...room, scene_id: id } : room)) });
+    },
     /** Replaces the rooms by those of an opened file. A file with one scene leaves them. */
     useRooms(rooms) {
       if (!rooms.length) return;
