@@ -30,7 +30,8 @@ export function roomsOf(scenes, records) {
   const isTyped = scenes.some(({ scene }) => scene?.room_type);
   const newest = new Map();
   scenes.forEach(({ name, scene, notes }, index) => {
-    const own = scene?.room_type ?? (isTyped ? '' : (notes && name) || scene?.scene_id || `scene ${index + 1}`);
+    if (!Array.isArray(scene?.objects)) return; // such as the last line of a recording, if it is cut off
+    const own = scene.room_type ?? (isTyped ? '' : (notes && name) || scene.scene_id || `scene ${index + 1}`);
     const before = newest.get(plain(own));
     if (own && !(timeOf(scene) < before?.time)) newest.set(plain(own), { name: own, scene: records.current(scene), index, time: timeOf(scene) });
   });
