@@ -310,7 +310,7 @@ def record_on_service(board: Board, *, status: int = 200) -> list[dict[str, Any]
         route.fulfill(response=response, json=document)
 
     def confirm(route: Route) -> None:
-        sent.append(route.request.post_data_json)
+        sent.append(json.loads(route.request.post_data or ""))
         problem = {"title": "Not recorded", "status": status, "detail": "The disk is full."}
         answer = {"request_id": "r", "scene_id": f"recorded-{len(sent)}"}
         route.fulfill(status=status, json=answer if status == 200 else problem)
