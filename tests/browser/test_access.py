@@ -36,7 +36,7 @@ def test_axe_finds_nothing_in_any_state(open_board: OpenBoard, scheme: str) -> N
     page.get_by_role("button", name="Actions for bed").click()
     found["menu"] = complaints(board)
     page.keyboard.press("Escape")
-    for tab in ("Wrong", "Relations", "Generate"):
+    for tab in ("Wrong", "Relations", "Where", "Generate"):
         board.tab(tab)
         found[tab] = complaints(board)
     board.click("Generate a scene")

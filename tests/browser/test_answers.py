@@ -363,3 +363,85 @@ def test_no_suggestion_stands_at_an_outlier(open_board: OpenBoard) -> None:
     board.add("wardrobe")
     assert board.ghosts == []
     assert not any(re.search(rf"{toilet} \d+ %", row) for row in board.rows("missing"))
+
+
+def test_wrong_detections_are_no_outliers(open_board: OpenBoard, api: httpx.Client) -> None:
+    weak = {"label": "toilet", "confidence": 0.1}
+    board = open_board({"objects": ["bed", "nightstand", "pillow", weak]})
+    board.tab("Wrong")
+    answer = ask(api, "outliers", board.scene)
+    (toilet,) = [one for one in answer["outliers"] if one["object"] == "toilet"]
+    assert toilet["reason"] == "misdetection"
+    row = board.rows("outliers")[0]
+    assert row.startswith("toilet probably a wrong detection")
+    assert f"{percent(toilet['real'])} real" in row
+    page = board.page
+    expect(page.get_by_role("button", name="Belongs here")).to_have_count(0)
+    expect(page.locator("#alarms")).to_be_hidden()
+    expect(page.locator("#board .outlier")).to_have_count(0)
+    expect(page.locator("#board .object.doubtful")).to_have_count(1)
+    spoken = board.thing("toilet").get_attribute("aria-label") or ""
+    assert spoken.endswith("probably a wrong detection")
+    expect(page.locator("#list li", has_text="toilet")).to_contain_text("wrong detection")
+    page.locator("#list .name").last.click()
+    page.get_by_label("Confidence").fill("1")
+    page.get_by_label("Confidence").press("Enter")
+    board.settle()
+    expect(page.locator("#board .object.doubtful")).to_have_count(0)
+
+
+def test_objects_of_several_rooms_are_split(open_board: OpenBoard, api: httpx.Client) -> None:
+    bedroom = ["bed", "nightstand", "wardrobe", "pillow"]
+    kitchen = ["oven", "refrigerator", "microwave", "stove"]
+    objects = [*bedroom, *kitchen, "toilet", "bathtub", "toilet paper"]
+    board = open_board({"objects": objects, "relations": [["oven", "left", "stove"]]})
+    (warning,) = ask(api, "outliers", board.scene)["warnings"]
+    assert warning["code"] == "several-rooms"
+    assert "several" not in board.rows("missing")[0]
+    note = board.column("missing").get_by_text(warning["message"])
+    expect(note).to_have_count(1)
+    board.tab("Wrong")
+    split = board.rows("outliers")[0]
+    assert split.startswith(f"The objects are probably from {len(warning['rooms'])} rooms")
+    expect(board.column("outliers").get_by_text(warning["message"])).to_have_count(0)
+    for part in warning["rooms"]:
+        assert f"{part['room_type']} ({len(part['objects'])}) Only these" in split
+        assert ", ".join(part["objects"]) in split
+    (part,) = [one for one in warning["rooms"] if "oven" in one["objects"]]
+    button = board.page.get_by_role("button", name=f"Only these: {part['room_type']}")
+    button.focus()
+    board.page.keyboard.press("Enter")
+    board.settle()
+    assert board.things == part["objects"]
+    assert board.scene["room_type"] == part["room_type"]
+    assert ("relations" in board.scene) == ({"oven", "stove"} <= {*part["objects"]})
+    board.click("Undo")
+    assert board.things == objects
+
+
+def test_labels_of_an_object_with_alternatives(open_board: OpenBoard, api: httpx.Client) -> None:
+    guess = {
+        "label": "bowl",
+        "confidence": 0.4,
+        "alternatives": [{"label": "toothbrush", "confidence": 0.4}],
+    }
+    board = open_board({"objects": ["sink", "toilet", "bathtub", guess]})
+    assert board.exported()["objects"][3] == {"id": "bowl", **guess}
+    (resolved,) = ask(api, "outliers", board.scene)["resolved"]
+    (first, second) = resolved["labels"]
+    assert first["label"] == "toothbrush"
+    words = (
+        f"labels: toothbrush {percent(first['probability'])}, bowl {percent(second['probability'])}"
+    )
+    row = board.page.locator("#list li").last
+    expect(row).to_contain_text(words)
+    board.tab("Wrong")
+    (shown,) = [row for row in board.rows("outliers") if row.startswith("bowl")]
+    assert words in shown
+    # The button makes the likeliest label the only one.
+    board.click("Rename bowl to toothbrush")
+    assert board.things[-1] == "toothbrush"
+    assert board.scene["objects"][-1] == {
+        "id": "toothbrush", "label": "toothbrush", "confidence": 0.4
+    }  # fmt: skip
+    expect(row).not_to_contain_text("labels:")

@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -188,14 +189,17 @@ def test_the_list_of_scenes_marks_alarms(board: Board, recorded: Path) -> None:
     choose(board, recorded, 1)
     scenes, status = board.page.locator("#scenes-of-file"), board.page.locator("#file-status")
     first, second, _ = (line["scene_id"] for line in lines(recorded))
-    expect(status).to_have_text(f"1 of 3 scenes with an open alarm. On the board: {first}.")
+    open_one = "0 of 2 habits confirmed. 1 of 3 scenes with an open alarm."
+    expect(status).to_have_text(f"{open_one} On the board: {first}.")
     marked = f"2 · ⚠ toilet, place of microwave · {second}"  # `adapt` names scenes by their id
     expect(scenes.locator("option").nth(1)).to_have_text(marked)
     board.click("Next alarm (scene 2)")
     board.click("Belongs here: toilet")
     board.click("Stands right: microwave")
     expect(scenes.locator("option:checked")).to_have_text(f"2 · ✓ confirmed · {second}")
-    expect(status).to_have_text(f"0 of 3 scenes with an open alarm. On the board: {second}.")
+    open_none = "2 of 2 habits confirmed. 0 of 3 scenes with an open alarm."
+    expect(status).to_have_text(f"{open_none} On the board: {second}.")
+    expect(board.page.locator("#enough")).to_contain_text("Enough is confirmed")
     expect(board.page.get_by_role("button", name="Next alarm")).to_be_hidden()
     scenes.select_option("0")
     board.settle()
@@ -203,6 +207,161 @@ def test_the_list_of_scenes_marks_alarms(board: Board, recorded: Path) -> None:
     scenes.select_option("1")
     board.tab("Wrong")
     assert any("confirmed" in row for row in board.rows("outliers") if "toilet" in row)
+
+
+@pytest.fixture
+def visits(tmp_path: Path) -> Path:
+    """A file with several visits of two rooms: a toilet and a bathtub are in the kitchen."""
+    kitchen, bedroom = ["refrigerator", "stove", "sink"], ["bed", "nightstand", "wardrobe"]
+    scenes = [
+        ("kitchen", [*kitchen, "toilet"]),
+        ("bedroom", [*bedroom, "lamp"]),
+        ("kitchen", [*kitchen, "microwave", "toilet"]),
+        ("kitchen", [*kitchen, "oven", "toilet", "bathtub"]),
+        ("bedroom", [*bedroom, "toilet"]),
+    ]
+    file = tmp_path / "visits.jsonl"
+    lines = [
+        {"scene_id": f"visit {n}", "group": "g", "room_type": room, "objects": labels}
+        for n, (room, labels) in enumerate(scenes, 1)
+    ]
+    file.write_text("".join(f"{json.dumps(line)}\n" for line in lines), "utf-8")
+    return file
+
+
+def marks(board: Board) -> list[str]:
+    """What the list says about each scene, without number, room type and name."""
+    options = board.page.locator("#scenes-of-file option").all_inner_texts()
+    return [" · ".join(words.split(" · ")[2:-1]) for words in options]
+
+
+def test_one_confirmation_covers_a_habit(board: Board, visits: Path, tmp_path: Path) -> None:
+    page, enough = board.page, board.page.locator("#enough")
+    status = page.locator("#file-status")
+    choose(board, visits, 1)
+    board.tab("Wrong")
+    expect(status).to_contain_text("0 of 3 habits confirmed. 4 of 5 scenes with an open alarm.")
+    assert marks(board) == ["⚠ toilet", "", "⚠ toilet", "⚠ toilet, bathtub", "⚠ toilet"]
+    expect(enough).to_be_hidden()
+    board.click("Belongs here: toilet")
+    expect(status).to_contain_text("1 of 3 habits confirmed. 2 of 5 scenes with an open alarm.")
+    # The toilet of the bedroom is another habit.
+    assert marks(board) == ["✓ confirmed", "", "✓ covered by scene 1", "⚠ bathtub", "⚠ toilet"]
+    page.locator("#scenes-of-file").select_option("2")
+    board.settle()
+    (row,) = [row for row in board.rows("outliers") if row.startswith("toilet")]
+    assert "✓ covered by scene 1" in row
+    expect(page.get_by_role("button", name="Belongs here: toilet")).to_have_count(0)
+    expect(page.locator("#board .object.outlier")).to_have_count(0)
+    expect(page.locator("#alarms")).to_be_hidden()
+    # A covered alarm does not keep a scene open.
+    board.click("Next alarm (scene 4)")
+    board.click("Belongs here: bathtub")
+    expect(page.get_by_text("Confirmed scene.")).to_be_visible()
+    # A removed object is no habit.
+    board.click("Next alarm (scene 5)")
+    board.press("toilet", "Delete")
+    board.click("This scene is right")
+    expect(status).to_contain_text("2 of 2 habits confirmed. 0 of 5 scenes with an open alarm.")
+    expect(enough).to_have_text("Enough is confirmed: adapt the model now (docs/own-home.md).")
+    assert Axe().run(page).response["violations"] == []
+    saved = lines(downloaded(board, tmp_path, 3, "visits.jsonl"))
+    assert [line.get("confirmed", False) for line in saved] == [True, False, False, True, True]
+    # Undo opens the alarm again.
+    board.click("Undo")
+    expect(enough).to_be_hidden()
+    assert marks(board)[-1] == "⚠ toilet"
+
+
+def test_a_habit_is_confirmed_once_in_a_scene(open_board: OpenBoard) -> None:
+    toilets = [{"id": f"toilet_{n}", "label": "toilet"} for n in (1, 2)]
+    board = open_board({"objects": ["stove", "refrigerator", "sink", *toilets]})
+    board.alter("outliers", with_alarms("toilet_1", "toilet_2", "stove"))
+    board.tab("Wrong")
+    board.page.get_by_label("Sensitivity").select_option("low")
+    board.settle()
+    board.click("Belongs here: toilet_2")
+    rows = [row for row in board.rows("outliers") if row.startswith("toilet")]
+    assert ["✓ covered by toilet_2" in row for row in sorted(rows)] == [True, False]
+    expect(board.page.locator("#confirmed")).to_contain_text("1 more alarm is open")
+    board.click("Belongs here: stove")
+    expect(board.page.get_by_text("Confirmed scene.")).to_be_visible()
+
+
+def with_alarms(*names: str) -> Callable[[Any], Any]:
+    """Return a change of an answer that raises an alarm at these objects only."""
+    return lambda found: (
+        found
+        | {
+            "outliers": [one | {"is_outlier": one["object"] in names} for one in found["outliers"]],
+            "misplaced": [],
+        }
+    )
+
+
+def record_on_service(board: Board, *, status: int = 200) -> list[dict[str, Any]]:
+    """Give the service the route of confirmed scenes, and return the list of their bodies."""
+    sent = list[dict[str, Any]]()
+
+    def with_route(route: Route) -> None:
+        response = route.fetch()
+        document = response.json()
+        document["paths"] |= {"/confirm": {}}
+        route.fulfill(response=response, json=document)
+
+    def confirm(route: Route) -> None:
+        sent.append(json.loads(route.request.post_data or ""))
+        problem = {"title": "Not recorded", "status": status, "detail": "The disk is full."}
+        answer = {"request_id": "r", "scene_id": f"recorded-{len(sent)}"}
+        route.fulfill(status=status, json=answer if status == 200 else problem)
+
+    board.page.route("**/openapi.json", with_route)
+    board.page.route("**/confirm", confirm)
+    return sent
+
+
+def test_the_service_records_confirmed_scenes(board: Board, recorded: Path) -> None:
+    sent = record_on_service(board)
+    choose(board, recorded, 3)
+    board.click("This scene is right")
+    confirmed = board.page.locator("#confirmed")
+    expect(confirmed).to_have_text("Confirmed scene. The service has recorded it.")
+    (body,) = sent
+    line = lines(recorded)[2]
+    assert body["confirmed"] is True
+    assert body["objects"] == line["objects"]
+    assert body["unknown_labels"] == "by-meaning"
+    board.click("Undo")
+    expect(confirmed).to_contain_text("still has this scene as confirmed (recorded-1)")
+    # The last change counts. A scene that leaves the board is sent at once.
+    choose(board, recorded, 2)
+    board.click("This scene is right")
+    board.press("toilet (track_5)", "Delete")
+    with board.page.expect_request("**/confirm"):
+        board.click("Next scene (3 of 3)")
+    assert len(sent) == 2
+    assert [thing["label"] for thing in sent[1]["objects"]] == KITCHEN[:-1]
+    assert sent[1]["viewer_frame"] is True
+
+
+def test_a_scene_that_the_service_refuses(open_board: OpenBoard) -> None:
+    board = open_board(allow=("503",))
+    record_on_service(board, status=503)
+    board.page.get_by_role("button", name="Is there: ").first.click()
+    expect(board.page.locator("#confirmed")).to_have_text(
+        "Confirmed scene. The service refuses it: The disk is full."
+    )
+
+
+def test_other_services_get_no_confirmed_scene(board: Board) -> None:
+    routes = list[str]()
+    board.page.on("request", lambda one: routes.append(one.url))
+    with board.page.expect_request("**/openapi.json"):
+        board.page.get_by_role("button", name="Is there: ").first.click()
+    board.settle()
+    board.click("Clear")
+    expect(board.page.locator("#confirmed")).to_be_hidden()
+    assert not any(url.endswith("/confirm") for url in routes)
 
 
 def test_additions_are_confirmed(board: Board, recorded: Path, tmp_path: Path) -> None:

@@ -151,7 +151,9 @@ def test_unknown_names_are_mapped_or_left_out_visibly(open_board: OpenBoard) -> 
     assert notes(board, 2) == "qwxzkvj not known, left out"
     assert notes(board, 3).startswith("tractor read by its meaning, like ")
     expect(board.page.locator("#room-error")).to_have_text("bedrom → bedroom?")
+    board.tab("Wrong")  # Suggestions take the room of names.
     names = board.page.locator("#board .labels text.name").all_text_contents()
+    board.tab("Missing")
     assert {"fridgee → fridge?", "qwxzkvj", "tractor"} < set(names)
     assert [thing["label"] for thing in board.scene["objects"]] == scene["objects"]
     expect(board.thing("qwxzkvj")).to_have_class(re.compile("unknown"))

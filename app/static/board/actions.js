@@ -69,7 +69,8 @@ export function createActions(store, say, menu) {
     const name = named(id);
     const own = id === find(id).label ? freshId(things, label) : id;
     const end = (name) => (name === id ? own : name);
-    const renamed = { ...find(id), id: own, label };
+    const { alternatives, ...thing } = find(id);
+    const renamed = { ...thing, id: own, label };
     const box = sized()(renamed);
     const others = things.filter((thing) => thing.id !== id).map(sized());
     // The typical size of the new label may need another place.

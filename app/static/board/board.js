@@ -2,7 +2,7 @@
 
 import { ROBOT, whereabouts } from './actions.js';
 import { drawEdges } from './edge_drawing.js';
-import { edgesOf, judgedBy } from './edges.js';
+import { edgesOf, isDoubtful, judgedBy } from './edges.js';
 import { drawGhosts } from './ghost_drawing.js';
 import { UNKNOWN_SIZE } from './geometry.js';
 import { ghostsOf, ROBOT_SIDE } from './ghosts.js';
@@ -11,13 +11,14 @@ import { inWords, leftOut, reading, sizesOf } from './questions.js';
 import { sizer } from './scene.js';
 import { changed } from './store.js';
 import { fit, gridStep, onScreen, ROUND } from './view.js';
+import { spotsOf } from './spots.js';
 import { nameOf } from './words.js';
 
 const MARK = 9; // radius of the mark of an outlier, in pixels
 const FONT = '500 13px system-ui, sans-serif';
 const SEEN = [
   'things', 'viewer', 'answers', 'shown', 'tab', 'selected', 'draft', 'words', 'at', 'models', 'posed',
-  'right', 'line',
+  'right', 'line', 'covered', 'room', 'where',
 ];
 
 /** Outlier entries of the shown model, by object id. */
@@ -88,6 +89,7 @@ export function createBoard(node, store, actions, takeGhost) {
 
   function drawObjects(state, boxes, wrong) {
     const left = leftOut(state, state.shown);
+    const spots = spotsOf(state);
     const focused = node.contains(document.activeElement) ? document.activeElement : null;
     const ordered = [...boxes].sort((a, b) => a.z - b.z || b.size.x * b.size.y - a.size.x * a.size.y);
     const each = objects.selectAll('g.object').data(ordered, (box) => box.id).join((enter) => {
@@ -105,6 +107,8 @@ export function createBoard(node, store, actions, takeGhost) {
       .classed('outlier', (box) => !state.draft && Boolean(wrong.get(box.id)?.is_outlier))
       .classed('unknown', (box) => !state.draft && left.has(box.id))
       .classed('new', (box) => Boolean(state.draft?.fresh.has(box.id)))
+      .classed('doubtful', (box) => !state.draft && isDoubtful(wrong.get(box.id)))
+      .classed('spot', (box) => spots.has(box.id))
       .classed('anchor', (box) => state.at?.object === box.id)
       .classed('loose', (box) => !state.draft && state.posed && !box.placed)
       .attr('transform', (box) => `translate(${view.across(box.y)},${view.down(box.x)}) rotate(${-box.yaw})`)
@@ -203,5 +207,7 @@ function described(box, state, boxes, wrong) {
   );
   if (below) parts.push(`on ${nameOf(below)}`);
   if (!state.draft && wrong.get(box.id)?.is_outlier) parts.push('does not belong here');
+  if (!state.draft && isDoubtful(wrong.get(box.id))) parts.push('probably a wrong detection');
+  if (spotsOf(state).has(box.id)) parts.push(`possible place of ${state.where.wanted}`);
   return parts.join(', ');
 }

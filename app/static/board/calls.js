@@ -25,8 +25,8 @@ function literal(value) {
 }
 
 /** Python code that uses the client of the service. */
-export function python(question, { objects, ...fields }) {
-  const things = objects.map((thing) => `        ${literal(thing)},\n`).join('');
+export function python(question, { objects, label, rooms, ...fields }) {
+  const things = (rooms ?? objects).map((thing) => `        ${literal(thing)},\n`).join('');
   const keywords = Object.entries(fields).map(([name, value]) => `        ${name}=${literal(value)},\n`);
   const key = hasKey() ? ', api_key=os.environ["SCENE_API_KEY"]' : '';
   return [
@@ -35,6 +35,7 @@ export function python(question, { objects, ...fields }) {
     '',
     `with Client(${JSON.stringify(service)}${key}) as scene:`,
     `    answer = scene.${question}(`,
+    ...(rooms ? [`        ${literal(label)},`] : []),
     `        [\n${things.replaceAll('        ', '            ')}        ],`,
     `${keywords.join('')}    )`,
     'print(answer.model_dump_json(indent=2))',

@@ -2,13 +2,14 @@
 
 import { curl, python } from './calls.js';
 import { bar, copy, el, redraw } from './dom.js';
-import { judgedBy } from './edges.js';
+import { isDoubtful, judgedBy } from './edges.js';
 import { accept, ghostsOf, likely, SHIFTED } from './ghosts.js';
 import { common, inWords, QUESTIONS, reading, whyNot } from './questions.js';
+import { newLine } from './records.js';
 import { changed } from './store.js';
-import { namesOf, percent, SPOKEN, wordOf } from './words.js';
+import { namesOf, percent, resolvedWords, SPOKEN, wordOf } from './words.js';
 
-const SEEN = ['answers', 'shown', 'models', 'things', 'tab', 'draft', 'words', 'at', 'posed', 'relations', 'room', 'right', 'line'];
+const SEEN = ['answers', 'shown', 'models', 'things', 'tab', 'draft', 'words', 'at', 'posed', 'relations', 'room', 'right', 'line', 'covered'];
 
 const PLACES = 2; // listed places of a missing object, likeliest first
 
@@ -27,11 +28,12 @@ function reasons(because, name, { company = [], raised = 1 } = {}) {
 }
 
 /** What a model did with unknown names, and the warnings of its answer. */
-function notes({ warnings = [] }, state, column, name) {
+function notes({ warnings = [] }, state, column, name, question) {
   const names = [...new Set(state.things.map(({ label }) => label))].map((label) => reading(state, column, 'objects', label));
   return [
     ...[...names, reading(state, column, 'rooms', state.room)].map(inWords).filter(Boolean).map((words) => (words.endsWith('?') ? words : `${words}.`)),
-    ...warnings.map(({ objects, message }) =>
+    // The list of outliers shows the split of the objects.
+    ...warnings.filter(({ code }) => code !== 'several-rooms' || question !== 'outliers').map(({ objects, message }) =>
       (objects.length ? `Check ${objects.map(name).join(', ')}: ${message}.` : `Note: ${message}.`)),
   ].join(' ');
 }
@@ -39,14 +41,14 @@ function notes({ warnings = [] }, state, column, name) {
 /** Whether the model answers a question: the training scenes of a model may have no relations. */
 const judges = (answer) => !answer?.warnings?.some(({ code }) => code === 'not-judged');
 
-const row = (kind, words, probability, flag, ...more) =>
+export const row = (kind, words, probability, flag, ...more) =>
   el('li', { class: flag.kind ?? '' },
     el('div', { class: 'headline' }, words, flag.words ? el('span', { class: 'flag' }, flag.words) : null,
-      el('span', {}, percent(probability)), ...(flag.buttons ?? [])),
+      el('span', {}, `${percent(probability)}${flag.unit ?? ''}`), ...(flag.buttons ?? [])),
     bar(probability, kind), ...more);
 
 /** A button that confirms an answer. The name of its object follows the visible words. */
-const verdict = (words, about, onclick) => el('button', {
+export const verdict = (words, about, onclick) => el('button', {
   type: 'button', class: 'verdict', 'data-key': `${words} ${about}`, 'aria-label': `${words}: ${about}`,
   // The second click of a double click would hit the next row.
   onclick: ({ detail }) => detail < 2 && onclick(),
@@ -54,6 +56,37 @@ const verdict = (words, about, onclick) => el('button', {
 
 /** The class of an entry, if the request has another word for it. */
 const classOf = ({ label, listed_as: word }) => (word ? el('p', { class: 'quiet' }, `class: ${label}`) : null);
+
+/** Whether a person has confirmed an entry, or the same habit elsewhere. */
+const confirmedWords = ({ confirmed, covered_by: by }, name) => (by ? `✓ covered by ${name(by)}` : confirmed ? 'confirmed' : '');
+
+/** The labels of an object with alternatives, as the other objects decide. */
+function labelsOf({ resolved }, { object }) {
+  const found = resolved?.find((one) => one.object === object);
+  return found ? el('p', { class: 'quiet' }, `labels: ${resolvedWords(found)}`) : null;
+}
+
+/** The objects of each room, if they are probably from several rooms. */
+function split({ warnings = [] }, name, store) {
+  const rooms = warnings.find(({ code }) => code === 'several-rooms')?.rooms ?? [];
+  if (!rooms.length) return [];
+  const parts = rooms.map(({ room_type: room, objects }) => el('li', {},
+    el('div', { class: 'headline' }, el('b', {}, `${room} (${objects.length})`), verdict('Only these', room, () => keepOnly(store, room, objects))),
+    el('p', { class: 'quiet' }, objects.map(name).join(', '))));
+  return [el('li', { class: 'rooms' },
+    el('p', {}, `The objects are probably from ${rooms.length} rooms, but the answers are about one room.`), el('ul', {}, ...parts))];
+}
+
+/** Leaves the objects of one room on the board, as a new scene. Undo brings the others back. */
+function keepOnly(store, room, objects) {
+  const { things, relations } = store.get();
+  const kept = new Set(objects);
+  store.edit({
+    things: things.filter(({ id }) => kept.has(id)).map(({ source, ...thing }) => thing),
+    relations: relations.filter(({ subject, object }) => kept.has(subject) && kept.has(object)),
+    room, selected: null, at: null, line: newLine(), right: [],
+  });
+}
 
 const ROWS = {
   missing(answer, name, state, store, column, verdicts) {
@@ -90,20 +123,23 @@ const ROWS = {
       row('outliers', el('button', {
         type: 'button', class: 'link', 'data-key': `of-${one.object}`,
         onclick: () => store.set({ selected: one.object }),
-      }, name(one.object)), one.probability, one.is_outlier
+      }, name(one.object)), isDoubtful(one) ? one.real : one.probability, one.is_outlier
         ? { kind: 'alarm', words: 'does not belong', buttons: [verdict('Belongs here', name(one.object), () => verdicts.belongs(one.object))] }
-        : { words: one.confirmed ? 'confirmed' : '' },
-      classOf(one), reasons(one.because, name, { company: one.usually_with, raised: -1 })));
+        : isDoubtful(one) ? { words: 'probably a wrong detection', unit: ' real' } : { words: confirmedWords(one, name) },
+      labelsOf(answer, one) ?? classOf(one),
+      // The reasons are about the place in the scene, not about the detector.
+      isDoubtful(one) ? null : reasons(one.because, name, { company: one.usually_with, raised: -1 })));
     const misplaced = answer.misplaced.filter((one) => one.is_misplaced || one.confirmed).map((one) =>
       row('outliers', el('b', {}, spoken(one, name)), one.probability, one.confirmed
-        ? { words: 'confirmed' }
+        ? { words: confirmedWords(one, name) }
         : { kind: 'alarm', words: 'in the wrong place', buttons: [verdict('Stands right', spoken(one, name), () => verdicts.standsRight(one))] },
         one.moved == null ? null : el('p', { class: 'quiet' }, `moved: ${name(one.moved)}`),
         one.confirmed && !isLearnt(one) ? el('p', { class: 'quiet' }, NOT_LEARNT) : null));
     const stated = state.posed || state.relations.length;
-    const alarms = answer.outliers.map((one) => one.is_outlier);
+    const order = answer.outliers.map((one) => (one.is_outlier ? 0 : isDoubtful(one) ? 1 : 2));
+    const of = (rank) => objects.filter((_, index) => order[index] === rank);
     return [
-      ...objects.filter((_, index) => alarms[index]), ...misplaced, ...objects.filter((_, index) => !alarms[index]),
+      ...split(answer, name, store), ...of(0), ...misplaced, ...of(1), ...of(2),
       stated ? null : el('li', { class: 'quiet' }, 'Places are not judged, because positions do not count as evidence.'),
     ].filter(Boolean);
   },
@@ -160,10 +196,11 @@ export function calls() {
   };
 }
 
-/** A problem document as text. Each error names its object of the request. */
+/** A problem document as text. Each error names its object, room or label of the request. */
 export function problemWords(problem, body) {
   const errors = (problem.errors ?? []).map(({ pointer, message, suggestions = [] }) => {
-    const about = body?.objects[/^#\/objects\/(\d+)/.exec(pointer)?.[1]]?.id;
+    const [, field, index] = /^#\/(objects|rooms|label)(?:\/(\d+))?/.exec(pointer) ?? [];
+    const about = field === 'label' ? body?.label : body?.[field]?.[index]?.id;
     return el('li', {}, `${about ? `${about}: ` : ''}${message}${suggestions.length ? ` (${suggestions.join(', ')}?)` : ''}`);
   });
   return [
@@ -211,7 +248,7 @@ export function createColumns(store, parents, askKey, verdicts) {
     own.note.textContent = [
       question === 'outliers' && answer?.threshold !== undefined ? `An object raises an alarm from ${percent(answer.threshold)}.` : '',
       shared ? `Both models answer about their ${shared.length} common classes.` : '',
-      notes(answer ?? {}, state, column, name), rows.length || !judges(answer) ? '' : answer ? NOTHING[question] : waiting,
+      notes(answer ?? {}, state, column, name, question), rows.length || !judges(answer) ? '' : answer ? NOTHING[question] : waiting,
     ].filter(Boolean).join(' ');
     own.calls.show(question, entry.body);
   }

@@ -35,7 +35,7 @@ export function combobox(input, list, entries, choose) {
     list.replaceChildren(
       ...found.map(({ label, alias }, index) => {
         const option = document.createElement('li');
-        option.id = `found-${index}`;
+        option.id = `${list.id}-${index}`;
         option.setAttribute('role', 'option');
         option.draggable = true;
         option.dataset.label = label;

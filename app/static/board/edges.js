@@ -9,24 +9,41 @@
  * @property {'expected' | 'holds' | 'disagrees' | 'misplaced' | 'drawn'} kind
  */
 
+import { aboutOf, classesOf, habitOf } from './habits.js';
 import { percent, SPOKEN } from './words.js';
 
 /** A relation as one text, for comparisons. */
 export const keyOf = ({ subject, relation, object }) => JSON.stringify([subject, relation, object]);
 
-/** The answer about outliers of a model, without the alarms that the user confirmed as right; undefined without an answer. */
-export function judgedBy(own, { things, right, line }) {
+/**
+ * The answer about outliers of a model, without the alarms that the user confirmed as right; undefined without an answer.
+ * `covered_by` names the confirmed scene or object that covers the habit behind an alarm.
+ */
+export function judgedBy(own, { things, right, line, room, covered }) {
   const answer = own.outliers?.answer;
   // In a confirmed scene, all objects belong there and stand right, also those that are added later.
   const belongs = new Set(things.filter((thing) => line.confirmed || thing.belongs).map(({ id }) => id));
-  if (!answer || !(belongs.size || right.length)) return answer ?? undefined;
+  if (!answer || !(belongs.size || right.length || covered.size)) return answer ?? undefined;
   const stands = (one) => line.confirmed || right.includes(keyOf(one));
+  const classes = classesOf(answer);
+  const habit = (one) => habitOf(aboutOf(one, classes), room);
+  const covers = new Map(covered);
+  for (const one of answer.outliers) if (one.is_outlier && belongs.has(one.object)) covers.set(habit(one), one.object);
+  for (const one of answer.misplaced) if (one.is_misplaced && stands(one)) covers.set(habit(one), one.subject);
+  const judged = (one, alarm, isRight) => {
+    if (isRight) return { ...one, [alarm]: false, confirmed: true };
+    const by = one[alarm] && covers.get(habit(one));
+    return by ? { ...one, [alarm]: false, confirmed: true, covered_by: by } : one;
+  };
   return {
     ...answer,
-    outliers: answer.outliers.map((one) => (belongs.has(one.object) ? { ...one, is_outlier: false, confirmed: true } : one)),
-    misplaced: answer.misplaced.map((one) => (one.is_misplaced && stands(one) ? { ...one, is_misplaced: false, confirmed: true } : one)),
+    outliers: answer.outliers.map((one) => judged(one, 'is_outlier', belongs.has(one.object))),
+    misplaced: answer.misplaced.map((one) => judged(one, 'is_misplaced', one.is_misplaced && stands(one))),
   };
 }
+
+/** Whether an object is probably a wrong detection, and no person has confirmed it. */
+export const isDoubtful = (one) => one?.reason === 'misdetection' && !one.confirmed;
 
 /** The alarms of an answer: outliers and misplaced relations. */
 export const wrongIn = (answer) => ({

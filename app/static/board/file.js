@@ -15,9 +15,10 @@ const MOST_SHOWN = 2 ** 20; // bytes; a browser needs a minute to show a text of
 /**
  * @typedef {{name: string, scene: object, notes?: object[]}} Found a scene of a text. Only scenes that the service has read have notes
  * @param {(scene: object, notes: string, line: object | undefined) => void} put puts a scene on the board; throws SceneError
+ * @param {(scenes: Found[], index: number, isNew: boolean) => void} whenPlaced gets the scenes of a text and the number of that on the board
  * @returns {{place: (index: number) => void}} puts another scene of the opened text on the board
  */
-export function fileDialog(store, records, recorded, put, say) {
+export function fileDialog(store, records, recorded, put, say, whenPlaced) {
   const get = (id) => document.getElementById(id);
   const [dialog, area, error, done, which, map, names] =
     ['file', 'json', 'json-error', 'share-done', 'which', 'label-map', 'label-names'].map(get);
@@ -140,6 +141,7 @@ export function fileDialog(store, records, recorded, put, say) {
     const lines = notes ? [] : linesOf(text.scenes, text.name);
     const line = lines.length ? records.open(lines, text.name)[index] : undefined;
     put(asRequest(line ?? given), inWords(notes ?? []), line);
+    whenPlaced(text.scenes, index, opened !== text);
     opened = text;
     recorded.open(lines, index);
     const count = text.scenes.length;

@@ -49,7 +49,7 @@ let last = { keys: [], ghosts: [] };
 export function ghostsOf(state) {
   const own = state.answers[state.shown];
   const model = state.models[state.shown];
-  const keys = [own, state.things, state.viewer, state.tab, state.words, state.draft, model, state.at, state.line];
+  const keys = [own, state.things, state.viewer, state.tab, state.words, state.draft, model, state.at, state.line, state.covered];
   if (last.keys.every((key, index) => key === keys[index]) && last.keys.length) return last.ghosts;
   const sizes = sizesOf(state, state.models[0]);
   const shown = own.missing?.answer && state.tab === 'missing' && !state.draft;

@@ -3,11 +3,12 @@
 import { whereabouts } from './actions.js';
 import { outliersOf } from './board.js';
 import { el, redraw } from './dom.js';
+import { isDoubtful } from './edges.js';
 import { isCertain, readings } from './questions.js';
 import { changed } from './store.js';
-import { nameOf } from './words.js';
+import { nameOf, resolvedWords } from './words.js';
 
-const SEEN = ['things', 'selected', 'answers', 'shown', 'viewer', 'draft', 'models', 'posed', 'line'];
+const SEEN = ['things', 'selected', 'answers', 'shown', 'viewer', 'draft', 'models', 'posed', 'line', 'covered', 'room', 'right'];
 
 export function createList(list, empty, count, actions) {
   function row({ id }) {
@@ -31,10 +32,11 @@ export function createList(list, empty, count, actions) {
   }
 
   /** What the list says about an object besides its name. */
-  function about(thing, state, out) {
+  function about(thing, state, found) {
     const where = !state.posed || state.draft ? null
       : thing.placed ? whereabouts(thing.x, thing.y, state.viewer) : 'position not given';
-    return [where, out ? 'does not belong here' : null].filter(Boolean).join(' · ');
+    const wrong = found?.is_outlier ? 'does not belong here' : isDoubtful(found) ? 'probably a wrong detection' : null;
+    return [where, wrong].filter(Boolean).join(' · ');
   }
 
   /** How a model reads an unknown label. Each similar label is a button that renames the object. */
@@ -43,6 +45,14 @@ export function createList(list, empty, count, actions) {
     onclick: () => actions.rename(id, name),
   }, `${name}?`)]));
 
+  /** The labels of an object with alternatives, and the first one if it is another label. */
+  function decided({ id, label }, state) {
+    const found = state.answers[state.shown].outliers?.answer?.resolved?.find((one) => one.object === id);
+    if (!found) return [];
+    const [first] = found.labels;
+    return [[`labels: ${resolvedWords(found)}`, ...(first && first.label !== label ? [first.label] : [])]];
+  }
+
   function draw(state) {
     const wrong = outliersOf(state);
     const things = state.draft?.things ?? state.things;
@@ -50,7 +60,8 @@ export function createList(list, empty, count, actions) {
     const rows = d3.select(list).selectAll('li').data(things, (thing) => thing.id)
       .join((enter) => enter.append(row));
     rows.each(function update(thing) {
-      const out = !state.draft && Boolean(wrong.get(thing.id)?.is_outlier);
+      const found = state.draft ? undefined : wrong.get(thing.id);
+      const out = Boolean(found?.is_outlier);
       const chosen = thing.id === state.selected;
       this.classList.toggle('selected', chosen);
       this.classList.toggle('outlier', out);
@@ -59,9 +70,10 @@ export function createList(list, empty, count, actions) {
       more.setAttribute('aria-label', `Actions for ${nameOf(thing)}`);
       remove.setAttribute('aria-label', `Remove ${nameOf(thing)}`);
       this.querySelector('.name b').textContent = nameOf(thing);
-      this.querySelector('.name span').textContent = about(thing, state, out);
-      this.querySelector('.error').classList.toggle('certain', isCertain(state, thing.label));
-      redraw(this.querySelector('.error'), (state.draft ? [] : readings(state, 'objects', thing.label)).map((one) => suggested(thing, one)));
+      this.querySelector('.name span').textContent = about(thing, state, found);
+      this.querySelector('.error').classList.toggle('certain', isCertain(state, thing.label) || Boolean(thing.alternatives));
+      const notes = state.draft ? [] : [...readings(state, 'objects', thing.label), ...decided(thing, state)];
+      redraw(this.querySelector('.error'), notes.map((one) => suggested(thing, one)));
     });
     empty.hidden = things.length > 0;
     count.textContent = things.length ? `(${things.length}${state.draft ? `, ${state.draft.fresh.size} new` : ''})` : '';

@@ -21,11 +21,14 @@ import { createRecords, newLine, withSources } from './records.js';
 import { settings } from './settings.js';
 import { fromHash } from './share.js';
 import { openAlarms } from './edges.js';
+import { createSender } from './confirming.js';
 import { changed, createStore } from './store.js';
 import { summary } from './summary.js';
 import { tabs } from './tabs.js';
 import { createRecorded } from './recorded.js';
 import { createVerdicts, isJudged, statusOf } from './verdicts.js';
+import { createWhere, roomsOf } from './where.js';
+import { nowhere } from './spots.js';
 
 const get = (id) => document.getElementById(id);
 const say = (words) => (get('live').textContent = words);
@@ -34,7 +37,7 @@ const store = createStore({
   things: [], relations: [], posed: false, viewer: { x: 0, y: 0, yaw: 0 }, room: '', models: ['default', ''], shown: 0,
   tab: 'missing', selected: null, at: null, sensitivity: 'medium', answers: [{}, {}], draft: null, words: {},
   down: false, complaint: '', epoch: 0, canUndo: false,
-  line: newLine(), right: [],
+  line: newLine(), right: [], covered: new Map(), where: nowhere(),
 });
 
 const OPENING = 4; // labels that the board shows for a model without examples
@@ -133,6 +136,7 @@ get('model').addEventListener('change', () => (get('news').hidden = true));
 get('second').addEventListener('change', () => (get('news').hidden = true));
 const verdicts = createVerdicts(store, say, actions.add);
 get('confirm-scene').addEventListener('click', verdicts.sceneIsRight);
+const where = createWhere(get('panel-where'), store, say, (index) => file.place(index));
 const views = [
   board.render,
   createProperties(get('properties'), store, actions), // leaves less room for the list
@@ -141,9 +145,10 @@ const views = [
     verdicts),
   createGeneration(get('generate'), get('drawn'), store, say),
   tabs(document.querySelector('[role=tablist]'), store),
+  where.render,
   settings(store),
   listExamples,
-  (state, previous) => changed(state, previous, 'line', 'things', 'right', 'answers', 'shown') && showRecords(),
+  (state, previous) => changed(state, previous, 'line', 'things', 'right', 'answers', 'shown', 'covered') && showRecords(),
 ];
 
 // Views draw at most once per frame, even if the state changes more often.
@@ -167,13 +172,17 @@ store.subscribe((state, previous) => {
 
 combobox(get('search'), get('found'), () => store.get().words[store.get().models[0]]?.objects ?? [],
   (label) => actions.add(label));
-const records = createRecords(store, showRecords);
+const sender = createSender(store, showRecords);
+const records = createRecords(store, showRecords, sender);
 const recorded = createRecorded(store, records, (index) => file.place(index));
 const file = fileDialog(store, records, recorded, (scene, notes, line) => {
   put(scene, {}, line);
   if (notes) note(`${get('note').textContent} ${notes}`.trim());
   if (!store.get().down) get('banner').hidden = true; // such as that of a broken link
-}, say);
+}, say, (scenes, index, isNew) => {
+  if (isNew) where.useRooms(roomsOf(scenes, records));
+  where.placed(index);
+});
 watchService(store, get('banner'), () => void reload());
 
 /** Says whether the scene is confirmed, and how many confirmed scenes can be downloaded. */
@@ -181,12 +190,13 @@ function showRecords() {
   const state = store.get();
   const isConfirmed = Boolean(state.line.confirmed);
   const open = openAlarms(state);
-  get('confirmed').hidden = !isConfirmed && !isJudged(state);
+  get('confirmed').hidden = !isConfirmed && !isJudged(state) && !sender.words(state.line);
   get('recorded').hidden = !state.line.objects && (isConfirmed || !isJudged(state));
   get('confirm-scene').hidden = isConfirmed;
   get('confirm-scene').textContent = `This scene is right${open ? ` (${open} false ${open === 1 ? 'alarm' : 'alarms'})` : ''}`;
   get('confirmed').textContent = isConfirmed
-    ? `Confirmed scene. Import, export downloads the file (${records.count()} confirmed).` : statusOf(state);
+    ? `Confirmed scene. ${sender.words(state.line) || `Import, export downloads the file (${records.count()} confirmed).`}`
+    : [isJudged(state) ? statusOf(state) : '', sender.words(state.line)].filter(Boolean).join(' ');
   recorded.draw();
 }
 

@@ -5,23 +5,30 @@
 
 import { call } from './api.js';
 import { el } from './dom.js';
+import { alarmsOf, habitOf } from './habits.js';
 import { asRequest } from './importing.js';
 import { sizesOf, UNKNOWN_LABELS } from './questions.js';
 import { fromScene, toScene } from './scene.js';
 import { changed } from './store.js';
-import { wordOf } from './words.js';
 
 const AT_ONCE = 64; // scenes in a batch, so that other clients wait a few milliseconds only
 
 /** @param {(index: number) => void} go puts a scene of the recording on the board */
 export function createRecorded(store, records, go) {
-  const [list, next, nextAlarm, status] = ['scenes-of-file', 'next-scene', 'next-alarm', 'file-status'].map((id) => document.getElementById(id));
+  const [list, next, nextAlarm, status, enough] = ['scenes-of-file', 'next-scene', 'next-alarm', 'file-status', 'enough'].map((id) => document.getElementById(id));
   let lines = [];
   let current = 0;
-  let alarms = []; // of each scene: names of what raises an alarm; undefined until the service has answered
+  let alarms = []; // of each scene, as `alarmsOf` returns them; undefined until the service has answered
+  let covered = new Map(); // habit → scene that covers it
   let asking = new AbortController();
 
-  const isOpen = (index) => alarms[index]?.length > 0 && !records.current(lines[index]).confirmed;
+  const habit = (alarm, { room_type: room }) => habitOf(alarm.about, room);
+  /** The alarms of a scene that no confirmation covers. */
+  const openOf = (index) => {
+    const line = records.current(lines[index]);
+    return line.confirmed ? [] : (alarms[index] ?? []).filter((one) => !covered.has(habit(one, line)));
+  };
+  const isOpen = (index) => openOf(index).length > 0;
   const following = () => lines.map((_, step) => (current + 1 + step) % lines.length).find((index) => index !== current && isOpen(index));
 
   /** Asks the model on the board about all scenes. */
@@ -60,18 +67,49 @@ export function createRecorded(store, records, go) {
     }
   }
 
+  /** Finds the habits that confirmed scenes cover. A removed object is no habit. */
+  function cover() {
+    covered = new Map();
+    lines.forEach((line, index) => {
+      const now = records.current(line);
+      if (!now.confirmed) return;
+      const labels = new Set(now.objects.map((entry) => entry.label ?? entry));
+      for (const one of alarms[index] ?? []) {
+        const key = habit(one, now);
+        if (!covered.has(key) && one.labels.every((label) => labels.has(label))) covered.set(key, `scene ${index + 1}`);
+      }
+    });
+    const before = store.get().covered;
+    if (covered.size !== before.size || [...covered].some(([key, by]) => before.get(key) !== by)) store.set({ covered });
+  }
+
+  /** Says how many habits are confirmed, and when none is left. */
+  function habits(open) {
+    const left = new Set(lines.flatMap((line, index) => openOf(index).map((one) => habit(one, records.current(line)))));
+    const done = alarms.length === lines.length && !open && alarms.some((found) => found.length);
+    if (done && enough.textContent !== ENOUGH) enough.textContent = ENOUGH;
+    else if (!done) enough.textContent = '';
+    const all = covered.size + left.size;
+    return all ? `${covered.size} of ${all} ${all === 1 ? 'habit' : 'habits'} confirmed. ` : '';
+  }
+
   function draw() {
     const several = lines.length > 1;
     for (const node of [list.parentElement, status]) node.hidden = !several;
+    cover();
     next.hidden = current + 1 >= lines.length;
     next.textContent = `Next scene (${current + 2} of ${lines.length})`;
     const open = lines.filter((_, index) => isOpen(index)).length;
     const alarm = following();
     nextAlarm.hidden = !several || alarm === undefined;
     nextAlarm.textContent = `Next alarm (scene ${alarm + 1})`;
-    if (!several) return;
+    const confirmed = several ? habits(open) : '';
+    if (!several) {
+      enough.textContent = '';
+      return;
+    }
     const known = alarms.length < lines.length ? `${alarms.length} of ${lines.length} scenes asked. ` : '';
-    status.textContent = `${known}${open} of ${lines.length} scenes with an open alarm. On the board: ${lines[current].scene_id}.`;
+    status.textContent = `${known}${confirmed}${open} of ${lines.length} scenes with an open alarm. On the board: ${lines[current].scene_id}.`;
     lines.forEach((line, index) => {
       const words = nameOf(line, index);
       if (list.options[index].textContent !== words) list.options[index].textContent = words;
@@ -80,8 +118,15 @@ export function createRecorded(store, records, go) {
   }
 
   function nameOf(line, index) {
-    const about = records.current(line).confirmed ? '✓ confirmed' : alarms[index]?.length ? `⚠ ${alarms[index].join(', ')}` : '';
-    return [index + 1, line.room_type, about, line.scene_id].filter(Boolean).join(' · ');
+    return [index + 1, line.room_type, about(line, index), line.scene_id].filter(Boolean).join(' · ');
+  }
+
+  function about(line, index) {
+    const now = records.current(line);
+    if (now.confirmed) return '✓ confirmed';
+    if (isOpen(index)) return `⚠ ${named(openOf(index))}`;
+    const [first] = alarms[index] ?? [];
+    return first ? `✓ covered by ${covered.get(habit(first, now))}` : '';
   }
 
   next.addEventListener('click', () => go(current + 1));
@@ -109,15 +154,11 @@ export function createRecorded(store, records, go) {
   };
 }
 
+const ENOUGH = 'Enough is confirmed: adapt the model now (docs/own-home.md).';
 const MOST_NAMED = 3;
 
-/** The words of the scene for outliers, and for the subjects of misplaced relations. */
-function alarmsOf(answer) {
-  if (!answer) return [];
-  const { outliers, misplaced } = answer;
-  const words = new Map(outliers.map((one) => [one.object, wordOf(one)]));
-  const found = [...outliers.filter((one) => one.is_outlier).map(wordOf),
-    ...misplaced.filter((one) => one.is_misplaced).map(({ subject }) => `place of ${words.get(subject) ?? subject}`)];
-  const names = [...new Set(found)];
-  return names.length > MOST_NAMED ? [...names.slice(0, MOST_NAMED), '…'] : names;
+/** The words of alarms, each once. */
+function named(alarms) {
+  const words = [...new Set(alarms.map((one) => one.words))];
+  return (words.length > MOST_NAMED ? [...words.slice(0, MOST_NAMED), '…'] : words).join(', ');
 }

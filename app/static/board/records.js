@@ -61,9 +61,9 @@ function ownEntry(thing, state) {
     const taken = new Set(state.things.map((other) => other.source?.entry.id));
     return { id: taken.has(id) ? `${id}_new` : id, label, ...at() };
   }
-  const { entry, before } = source;
+  const { entry: { alternatives, ...entry }, before } = typeof source.entry === 'string' ? { ...source, entry: { id } } : source;
   const moved = ['x', 'y', 'z', 'yaw', 'size'].some((name) => thing[name] !== before[name]);
-  return { ...(typeof entry === 'string' ? { id } : entry), label, ...(moved && at()) };
+  return { ...entry, ...(alternatives && thing.alternatives && { alternatives }), label, ...(moved && at()) };
 }
 
 /** The objects of a new scene, in the axes of the robot. */
@@ -91,8 +91,12 @@ function pose(thing, state, { x, y, yaw }) {
 
 const AXES = ['x', 'y', 'z'];
 
-/** Keeps the confirmed scenes of the board. @param {() => void} whenChanged */
-export function createRecords(store, whenChanged) {
+/**
+ * Keeps the confirmed scenes of the board.
+ * @param {() => void} whenChanged
+ * @param {{keep: (line: object) => void, drop: (id: string) => void}} sender gets each scene that the user confirms
+ */
+export function createRecords(store, whenChanged, sender) {
   const confirmed = new Map(stored()); // scene_id → {line, of}; of: the first scene_id of the opened file, or ''
   let file = new Map();
   let name = 'scenes.jsonl';
@@ -105,6 +109,7 @@ export function createRecords(store, whenChanged) {
     }
     const entry = { line, of: confirmed.get(line.scene_id)?.of ?? opened() };
     confirmed.set(line.scene_id, entry);
+    sender.keep(line);
     try {
       localStorage.setItem(PREFIX + line.scene_id, JSON.stringify(entry));
     } catch {
@@ -114,6 +119,7 @@ export function createRecords(store, whenChanged) {
 
   function drop(id) {
     confirmed.delete(id);
+    sender.drop(id);
     forget([id]);
   }
 

@@ -33,6 +33,7 @@ export function toScene({ things, relations, posed, viewer, room }, sizes) {
       id: thing.id,
       label: thing.label,
       ...(thing.confidence < 1 && { confidence: thing.confidence }),
+      ...(thing.alternatives && { alternatives: thing.alternatives }),
       ...(posed && thing.placed && poseOf(sizer(sizes)(thing))),
     })),
     ...(!posed && stated.length && { relations: stated }),
@@ -178,7 +179,8 @@ function readThing(entry, id, index, before, sizes) {
   const thing = { id, label: found.label, size, yaw: round(yaw, 2), confidence, x: 0, y: 0, z: 0 };
   const height = sizer(sizes)(thing).size.z;
   const at = position && { x: position.x, y: position.y, z: round(position.z - height / 2) };
-  return { ...thing, ...at, placed: Boolean(position) };
+  const { alternatives } = found;
+  return { ...thing, ...at, placed: Boolean(position), ...(alternatives?.length && { alternatives }) };
 }
 
 const AROUND = 0.5; // metres that stay free around the robot

@@ -2,11 +2,12 @@
 
 import { outliersOf } from './board.js';
 import { el } from './dom.js';
-import { edgesOf, judgedBy, wrongIn } from './edges.js';
+import { edgesOf, isDoubtful, judgedBy, wrongIn } from './edges.js';
 import { UNKNOWN_SIZE } from './geometry.js';
 import { ghostsOf } from './ghosts.js';
 import { inWords, isCertain, leftOut, mappedBy, readings, sizesOf } from './questions.js';
 import { sizer } from './scene.js';
+import { spotsOf } from './spots.js';
 import { changed } from './store.js';
 import { namesOf, percent, plain, SPOKEN } from './words.js';
 
@@ -14,7 +15,7 @@ const get = (id) => document.getElementById(id);
 
 /** The symbols of the board in words; the legend lists those that are visible. */
 const SYMBOLS = {
-  robot: 'robot and the direction it looks in', selected: 'selected', outlier: 'does not belong',
+  robot: 'robot and the direction it looks in', selected: 'selected', outlier: 'does not belong', doubtful: 'probably a wrong detection', spot: 'possible place of the thing',
   unknown: 'not known to the model, left out', guess: 'size not known', loose: 'position not given', anchor: 'place of the question', ghost: 'suggestion: click to add it',
   misplaced: 'probably in the wrong place', holds: 'observed', expected: 'expected',
   disagrees: 'expected instead of what is observed', fresh: 'generated', drawn: 'relation',
@@ -25,6 +26,7 @@ function visible(state) {
   const edges = new Set(edgesOf(state).map(({ kind }) => kind));
   const seen = {
     robot: true, selected, outlier: [...outliersOf(state).values()].some((one) => one.is_outlier),
+    doubtful: [...outliersOf(state).values()].some(isDoubtful), spot: spotsOf(state).size,
     unknown: things.some(({ id }) => leftOut(state, state.shown).has(id)),
     guess: [...things.map(sizer(sizesOf(state, state.models[0]))), ...ghostsOf(state)].some(({ size }) => size === UNKNOWN_SIZE),
     loose: posed && things.some(({ placed }) => !placed), anchor: at, ghost: ghostsOf(state).length,
@@ -86,7 +88,7 @@ export function settings(store) {
     get('at').hidden = !state.at;
     if (state.at) get('at-words').textContent = `Missing ${SPOKEN[state.at.relation]} ${namesOf(state.things)(state.at.object)}`;
     if (changed(state, previous, 'words', 'models', 'room', 'shown') || roomsOf(state) !== roomsOf(previous) || roomRead(state) !== roomRead(previous)) rooms(state);
-    if (changed(state, previous, 'answers', 'shown', 'draft', 'things', 'right', 'line')) {
+    if (changed(state, previous, 'answers', 'shown', 'draft', 'things', 'right', 'line', 'covered', 'room')) {
       const answer = judgedBy(state.answers[state.shown], state);
       const { outliers, misplaced } = answer ? wrongIn(answer) : { outliers: [], misplaced: [] };
       get('alarms').textContent = outliers.length + misplaced.length;

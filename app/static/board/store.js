@@ -13,6 +13,7 @@
  * @property {number} yaw degrees, from x towards y
  * @property {number} confidence
  * @property {boolean} placed whether its position comes from the scene or the user, not from the page
+ * @property {{label: string, confidence: number}[]} [alternatives] other labels of the detector
  * @property {boolean} [belongs] whether the user confirmed that it belongs here
  * @property {object} [source] its entry in the opened file, and the object as it was then
  */

@@ -62,3 +62,6 @@ export const SPOKEN = {
 
 export const percent = (probability) =>
   probability > 0 && probability < 0.01 ? '<\u00a01\u00a0%' : `${Math.round(100 * probability)}\u00a0%`;
+
+/** The labels of an object with alternatives, likeliest first: "bowl 72 %, cup 28 %". */
+export const resolvedWords = ({ labels }) => labels.map(({ label, probability }) => `${label} ${percent(probability)}`).join(', ');
