@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.client.ros_messages import Layout, blank, through_cdr
+from tests.client.ros_messages import OWN, Layout, blank, through_cdr
 
 STORE = Layout.current
 PACKAGE = Path(__file__).resolve().parents[2] / "clients" / "ros2" / "scene_reasoning"
@@ -109,8 +109,20 @@ class Ros:
         names = {
             "builtin_interfaces": ["Time"],
             "std_msgs": ["Header", "String"],
-            "geometry_msgs": ["Point", "Pose", "PoseWithCovarianceStamped", "Quaternion", "Vector3"],
-            "scene_reasoning_msgs": ["Place", "RoomProbability", "SceneEvent", "Thing", "ThingArray"],
+            "geometry_msgs": [
+                "Point",
+                "Pose",
+                "PoseWithCovarianceStamped",
+                "Quaternion",
+                "Vector3",
+            ],
+            "scene_reasoning_msgs": [
+                "Place",
+                "RoomProbability",
+                "SceneEvent",
+                "Thing",
+                "ThingArray",
+            ],
             "vision_msgs": ["Detection3DArray", "Detection2DArray", "LabelInfo"],
             "visualization_msgs": ["Marker", "MarkerArray"],
             "diagnostic_msgs": ["DiagnosticArray", "DiagnosticStatus", "KeyValue"],
@@ -121,7 +133,7 @@ class Ros:
         }
         members |= {package: {} for package in names}
         members["scene_reasoning_msgs.srv"] = {
-            name: service_type(f"scene_reasoning_msgs/msg/{name}") for name in ("Confirm", "WhereIs")
+            name: service_type(f"{OWN.name}/msg/{name}") for name in ("Confirm", "WhereIs")
         }
         members["rclpy"] = dict.fromkeys(("init", "try_shutdown"), lambda: None)
         members["rclpy"]["spin"] = lambda node, executor=None: self.spun.append(node)

@@ -1,4 +1,4 @@
-"""The generators of ROS 2 read the messages and services of the node, and compilers their output."""
+"""The generators of ROS 2 read the interfaces of the node, and compilers read their output."""
 
 import json
 import os

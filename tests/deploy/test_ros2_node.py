@@ -1,7 +1,6 @@
 """The ROS 2 node against a running service and against a stand-in of it, and its parts alone."""
 
 import importlib
-import json
 import math
 import threading
 from collections.abc import Callable, Iterator

@@ -22,7 +22,7 @@ class Converter:
         label_map: labels of the class ids; may be replaced at any time.
         min_score: detections with a lower score are left out.
         boxes: False if boxes are in pixels; positions are then taken from the hypotheses.
-        conventions: conventions of the boxes that are not those of ROS, such as ``{"units": "cm"}``.
+        conventions: conventions of the boxes other than those of ROS, such as ``{"units": "cm"}``.
 
     Raises:
         MessageError: an invalid label map.

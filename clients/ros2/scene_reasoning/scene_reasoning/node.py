@@ -64,9 +64,8 @@ class SceneNode(Node):
 
     def __init__(self) -> None:
         super().__init__("scene")
-        settings = Settings(
-            **{n: self._parameter(f"settings.{n}", value) for n, value in asdict(Settings()).items()}
-        )
+        defaults = asdict(Settings())
+        settings = Settings(**{n: self._parameter(f"settings.{n}", defaults[n]) for n in defaults})
         key_file, rooms = self._parameter("api_key_file", ""), self._parameter("rooms", "")
         self.client = Client(
             self._parameter("url", "http://127.0.0.1:8000"),
