@@ -1,4 +1,4 @@
-"""Ask the five questions about labels and positions, and branch on errors."""
+"""Ask the six questions about labels and positions, and branch on errors."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ ROOM = {
     "objects": [DESK, LAMP, "moniter", "keyboard", "qwzx", "toilet"],
     "unknown_labels": "nearest-or-ignore",
 }
+HOME = [{"id": "office", "objects": [DESK]}, {"id": "bathroom", "objects": ["toilet", "sink"]}]
 
 
 def ask(scene: Client) -> None:
@@ -27,12 +28,13 @@ def ask(scene: Client) -> None:
     print("relations:", [(r.subject, r.relation, r.object) for r in seen.observed_relations])
     missing = scene.missing(**ROOM, at=("on-top", "desk_1"), top_k=3).missing
     print("missing on the desk:", [f"{thing.label} {thing.probability:.2f}" for thing in missing])
-    outliers = scene.outliers(**ROOM).outliers
-    print("outliers:", [thing.object for thing in outliers if thing.is_outlier])
+    print("outliers:", [one.object for one in scene.outliers(**ROOM).outliers if one.is_outlier])
     (room,) = scene.rooms(**ROOM, top_k=1).room_types
     print("room:", room.room_type)
     (drawn,) = scene.generate(**ROOM, seed=7).scenes
     print("a whole room:", drawn.objects)
+    (place,) = scene.where("toothbrush", HOME, searched=[{"room": "office"}], top_k=1).places
+    print("the toothbrush:", place.room, f"{place.probability:.2f}")
 
 
 def main() -> int:

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Ask the five questions by curl. SCENE_URL is the address of the service.
+# Ask the six questions by curl. SCENE_URL is the address of the service.
 set -euo pipefail
 url=${SCENE_URL:-http://127.0.0.1:8000}
 
@@ -23,3 +23,7 @@ ask rooms '{"objects": ["bathtub", "sink", "towel"], "top_k": 1, "detail": "scor
 
 # What would a whole bedroom with a desk look like? The same seed gives the same scene.
 ask generate '{"objects": ["desk"], "room_type": "bedroom", "seed": 7}'
+
+# In which room is the toothbrush, and where? The robot has looked at the sink.
+ask where '{"label": "toothbrush", "rooms": [{"id": "kitchen", "objects": ["fridge", "stove"]},
+  {"id": "bathroom", "objects": ["toilet", "sink"]}], "searched": [{"room": "bathroom", "object": "sink"}]}'

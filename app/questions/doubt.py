@@ -12,7 +12,12 @@ A detection is real if object and label are right. Its log-odds (`RealFit`) rise
 and with s_i. A detection of confidence 1 is real.
 
 A probable intruder and a probably wrong detection say little about the scene. So other answers
-weight the presence of an object of class i by real · (1 - sigmoid(l_i)) (`believed`).
+weight the presence of an object of class i by real · (1 - sigmoid(l_i)) (`believed`). The room type
+has a mixture over the hypotheses that nothing, or one class k, is an intruder (`room_log_p`):
+
+    p(t) = (p(t | v) + sum_k w_k p(t | v without k)) / (1 + sum_k w_k),   w_k = exp(l_k + `PRIOR`)
+
+The sum is over the `HYPOTHESES` classes with the largest l_k.
 
 The doubt about classes that are not judged, and about a single class, is that of the detector
 alone: s_i counts as 0.
@@ -21,6 +26,7 @@ Source of contextual re-scoring: Hoiem, Efros and Hebert, "Putting objects in pe
 """
 
 import math
+from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -34,6 +40,11 @@ from app.model.scene_model import SceneModel
 from app.questions.posterior import Posterior
 from app.scene.scene import Scene, pool_classes
 
+HYPOTHESES: Final = 4
+PRIOR: Final = 2.0  # log-odds; it costs less of the room types with an intruder than 0, 1 and 3
+_LARGEST: Final = 50.0  # log weight of a hypothesis
+_SMALLEST: Final = 1e-300  # probability of a room type
+_LEAST_WEIGHT: Final = 1e-3  # of all hypotheses together
 LEAST_REAL: Final = 0.5
 """Least probability of a right detection at which an object may raise an alarm."""
 
@@ -46,7 +57,8 @@ class Doubt(NamedTuple):
     logits: Float[Floats, "n"]  # of an intruder; -inf if the class is not judged
     p: Float[Floats, "n"]  # probability of an intruder; 0 if the class is not judged
     real: Float[Floats, "N"]  # probability that each object is a right detection
-    presence: Float[Floats, "n"]  # of each class, weighted by doubt
+    exists: Float[Floats, "n"]  # presence of each class, weighted by `real`
+    presence: Float[Floats, "n"]  # presence of each class, weighted by all doubt
 
 
 def doubt(model: SceneModel, posterior: Posterior, log_odds: Float[Floats, "n"]) -> Doubt:
@@ -64,10 +76,12 @@ def doubt(model: SceneModel, posterior: Posterior, log_odds: Float[Floats, "n"])
         entry is not None,
     )
     real: Float[Floats, "N"] = present.confidence
+    exists: Float[Floats, "n"] = present.presence
     if model.calibration.real is not None and real.min() < 1.0:
         real = _real(model.calibration.real, real, score[present.row], n)
-        presence *= pool_classes(present.classes[present.row], real)[4] / present.presence
-    return Doubt(logits, p, real, presence)
+        exists = pool_classes(present.classes[present.row], real)[4].astype(np.float32)
+        presence *= exists / present.presence
+    return Doubt(logits, p, real, exists, presence)
 
 
 @compiled
@@ -125,3 +139,25 @@ def believed(model: SceneModel, scene: Scene) -> Posterior:
     about = doubt(model, posterior, posterior.given_rest()[0])
     posterior.weight(about.presence)
     return posterior
+
+
+def room_log_p(
+    model: SceneModel, scene: Scene
+) -> tuple[Posterior, Float[NDArray[np.float64], "C"]]:
+    """Return the posterior without the room type of a scene, and log p(t) of each room type t.
+
+    Only `real` weights the posterior. The mixture over intruders is in log p(t).
+    """
+    posterior = Posterior(model, replace(scene, room_type=None))
+    if not scene.objects:
+        return posterior, posterior.room_log_p()
+    about = doubt(model, posterior, posterior.given_rest()[0])
+    posterior.weight(about.exists)
+    log_p = posterior.room_log_p()
+    chosen = np.argsort(-about.logits, kind="stable")[:HYPOTHESES]
+    weights = np.exp(np.minimum(about.logits[chosen] + PRIOR, _LARGEST))
+    total = float(weights.sum())
+    if posterior.listed < 2 or total < _LEAST_WEIGHT:
+        return posterior, log_p
+    mixture = np.exp(log_p) + weights @ np.exp(posterior.room_log_p_without(chosen))
+    return posterior, np.log(np.maximum(mixture / (1.0 + total), _SMALLEST))

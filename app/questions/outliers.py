@@ -114,7 +114,7 @@ def _judged(
     """
     present, vocabulary = posterior.present, model.vocabulary
     labels, broader = vocabulary.labels, vocabulary.broader_labels
-    logits, p, real, presence = about
+    logits, p, real, _, presence = about
     reaches = (p >= threshold) & (posterior.listed > 1)
     may_alarm = reaches & can_alarm[present.classes]
     # The order follows the logits, because probabilities near 0 or 1 may round to the same number.

@@ -141,11 +141,15 @@ class Posterior:
     ) -> Float[Doubles, "B C"]:
         return self._objects.room_log_p(x, self.present.classes, presence, self._profile)
 
+    def room_log_p_without(self, rows: Int[Indices, "m"]) -> Float[Doubles, "m C"]:
+        """Return log p(t | objects) of each room type without the class in each of the rows."""
+        presence = np.tile(self.present.presence, (len(rows), 1))
+        presence[np.arange(len(rows)), rows] = 0.0
+        return self._room_log_p(self.context.x - self.context.contributions[rows], presence)
+
     def room_reasons(self) -> Float[Doubles, "C n"]:
         """Return the log-odds of each room type minus its log-odds without each class."""
-        # Row k has the logits of h1 and the presence of the classes in the scene without class k.
-        x, presence = self.context.x - self.context.contributions, self.present.presence
-        without = self._room_log_p(x, presence * (1 - np.eye(len(presence), dtype=np.float32)))
+        without = self.room_log_p_without(np.arange(len(self.present.classes)))
         return (log_odds_of(self.room_log_p()) - log_odds_of(without)).T
 
     def relation_log_odds(self) -> Float[Floats, "A n n"]:

@@ -7,7 +7,6 @@ of the request. The machine's probability of a room type t (`app.inference.objec
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -15,7 +14,7 @@ import numpy as np
 from app.inference.elementary import softmax
 from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, reasons, significant
-from app.questions.doubt import believed
+from app.questions.doubt import room_log_p
 from app.questions.names import ErrorList
 from app.questions.posterior import LEAST_CHANGE
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
@@ -48,9 +47,8 @@ def rooms(
     among = np.arange(C) if candidates is None else np.array([*candidates], dtype=np.int64)
     if not len(among):
         return {"warnings": [] if C else [_NO_ROOM_TYPES], "room_types": []}
-    posterior = believed(model, replace(scene, room_type=None))
+    posterior, log_p = room_log_p(model, scene)
     sharpness = model.calibration.rooms.of(posterior.listed)
-    log_p = posterior.room_log_p()
     if candidates is not None:
         log_p = log_p - model.room_prior
     p = softmax(sharpness * log_p[among])

@@ -278,22 +278,25 @@ _SHARED: Final = (
 """Fields of a request that its scenes share."""
 
 _HOME: Final[dict[str, Any]] = {
-    "label": "toothbrush",
+    "label": "lamp",
     "rooms": [
-        {"id": "kitchen", "objects": ["fridge", "stove", "counter"]},
-        {"id": "bathroom", "objects": ["toilet", "bathtub", {"id": "sink_1", "label": "sink"}]},
-        {"id": "bedroom", "objects": ["bed", "nightstand", "wardrobe"]},
+        {"id": "office", "objects": ["desk", "chair", "keyboard"]},
+        {"id": "bathroom", "objects": ["toilet", "sink"]},
+        {
+            "id": "bedroom",
+            "objects": ["bed", "pillow", {"id": "nightstand_1", "label": "nightstand"}],
+        },
     ],
 }
 _EXAMPLES: Final = {
     "home": Example("three rooms with the objects that the robot has seen", _HOME),
     "searched": Example(
-        "the robot has looked at the sink and in half of the kitchen",
+        "the robot has looked at the nightstand and in half of the office",
         {
             **_HOME,
             "searched": [
-                {"room": "bathroom", "object": "sink_1"},
-                {"room": "kitchen", "seen_share": 0.5},
+                {"room": "bedroom", "object": "nightstand_1"},
+                {"room": "office", "seen_share": 0.5},
             ],
         },
     ),
@@ -303,13 +306,13 @@ _EXAMPLES: Final = {
             "label": "pillow",
             "rooms": [
                 {"id": "room_1", "room_type": "bedroom"},
-                {"id": "room_2", "room_type": "kitchen"},
+                {"id": "room_2", "room_type": "bathroom"},
             ],
         },
     ),
-    "listed": Example("the robot has seen such a thing", {**_HOME, "label": "wardrobe"}),
-    "unknown-labels": Example(
-        "a thing that the model does not know", {**_HOME, "label": "tothbrush"}, "unknown-labels"
+    "listed": Example("the robot has seen such a thing", {**_HOME, "label": "pillow"}),
+    "unknown-thing": Example(
+        "a thing that the model does not know", {**_HOME, "label": "lammp"}, "unknown-labels"
     ),
     "invalid-request": Example(
         "a searched room that is not in the home",
@@ -321,17 +324,23 @@ _EXAMPLES: Final = {
     ),
 }
 _EXAMPLE_ANSWER: Final = {
-    "label": "toothbrush",
+    "label": "lamp",
     "places": [
-        {"room": "bathroom", "probability": 0.41},
-        {"room": "bathroom", "probability": 0.38, "relation": "on-top", "object": "sink_1"},
+        {
+            "room": "bedroom",
+            "probability": 0.42,
+            "relation": "on-top",
+            "object": "nightstand_1",
+        },
+        {"room": "office", "probability": 0.18, "relation": "on-top", "object": "desk"},
+        {"room": "bedroom", "probability": 0.14},
     ],
     "rooms": [
-        {"room": "bathroom", "probability": 0.79},
-        {"room": "bedroom", "probability": 0.04},
-        {"room": "kitchen", "probability": 0.02},
+        {"room": "bedroom", "probability": 0.58},
+        {"room": "office", "probability": 0.27},
+        {"room": "bathroom", "probability": 0.02},
     ],
-    "not_here": 0.15,
+    "not_here": 0.13,
 }
 
 _TEXT: Final = """

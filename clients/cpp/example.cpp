@@ -1,4 +1,4 @@
-// Asks a running service the five questions about a bedroom: ./example [URL [SECONDS]]
+// Asks a running service the six questions about a bedroom: ./example [URL [SECONDS]]
 #include <cstdio>
 #include <cstdlib>
 #include <iostream>
@@ -24,7 +24,10 @@ int main(int argc, char** argv) {
     return 2;
   }
 
-  const json lamp = {{"id", "lamp_1"}, {"label", "lamp"}, {"confidence", 0.92}};
+  // The detector is unsure: it may also be a candle. The other objects decide (`resolved`).
+  const json candle = {{"label", "candle"}, {"confidence", 0.3}};
+  json lamp = {{"id", "lamp_1"}, {"label", "lamp"}, {"confidence", 0.6}};
+  lamp["alternatives"] = json::array({candle});
   const json on = {{"subject", "lamp_1"}, {"relation", "on-top"}, {"object", "nightstand"}};
   json room;
   room["objects"] = {"bed", "nightstand", lamp};
@@ -53,6 +56,9 @@ int main(int argc, char** argv) {
 
     std::cout << "Least fitting first:\n";
     const json outliers = service.outliers(room);
+    for (const auto& entry : outliers.value("resolved", json::array()))
+      std::cout << "  " << entry["object"].get<std::string>() << " is probably a "
+                << entry["labels"][0]["label"].get<std::string>() << "\n";
     for (const auto& entry : outliers["outliers"])
       std::cout << "  " << entry["object"].get<std::string>() << " " << entry["probability"]
                 << (entry["is_outlier"].get<bool>() ? " does not belong here" : "") << "\n";
@@ -65,10 +71,28 @@ int main(int argc, char** argv) {
     }
 
     std::cout << "Which room it is:\n";
-    const json rooms = service.rooms({{"objects", room["objects"]}, {"top_k", 3}});
+    question = {{"objects", room["objects"]}, {"top_k", 3}};
+    question["unknown_labels"] = "by-meaning";
+    const json rooms = service.rooms(question);
     for (const auto& entry : rooms["room_types"])
       std::cout << "  " << entry["room_type"].get<std::string>() << " " << entry["probability"]
                 << "\n";
+
+    std::cout << "Where the phone is:\n";
+    const json bedroom = {{"id", "bedroom"}, {"objects", room["objects"]}};
+    const json kitchen = {{"id", "kitchen"}, {"objects", {"fridge", "stove", "counter"}}};
+    question = {{"label", "phone"}, {"rooms", {bedroom, kitchen}}, {"top_k", 3}};
+    question["unknown_labels"] = "by-meaning";
+    question["searched"] = json::array({{{"room", "kitchen"}, {"object", "counter"}}});
+    const json places = service.where(question);
+    for (const auto& place : places["places"]) {
+      std::cout << "  " << place["room"].get<std::string>();
+      if (place.contains("relation"))  // the rest of the room has no relation
+        std::cout << " " << place["relation"].get<std::string>() << " "
+                  << place["object"].get<std::string>();
+      std::cout << " " << place["probability"] << "\n";
+    }
+    std::cout << "  not here " << places["not_here"] << "\n";
 
     std::cout << "A scene like it:\n";
     question = {{"objects", {"bed"}}, {"seed", 7}};

@@ -107,7 +107,7 @@ class Client {
     http_.set_decompress(false);  // a decompressed body could have any size
   }
 
-  // The five questions. `timeout` limits one call; the default is `Options::timeout`.
+  // The six questions. `timeout` limits one call; the default is `Options::timeout`.
   json relations(const json& request, std::optional<Seconds> timeout = {}) {
     return call("POST", "/relations", request, timeout);
   }
@@ -123,9 +123,12 @@ class Client {
   json generate(const json& request, std::optional<Seconds> timeout = {}) {
     return call("POST", "/generate", request, timeout);
   }
+  json where(const json& request, std::optional<Seconds> timeout = {}) {
+    return call("POST", "/where", request, timeout);
+  }
 
-  // One question about many scenes. `scenes` is an array of requests; each request has its own
-  // entry in `results` of the answer.
+  // One question about many scenes or homes. `scenes` is an array of requests; each request has its
+  // own entry in `results` of the answer.
   json relations_batch(const json& scenes, std::optional<Seconds> timeout = {}) {
     return call("POST", "/relations/batch", {{"scenes", scenes}}, timeout);
   }
@@ -137,6 +140,9 @@ class Client {
   }
   json rooms_batch(const json& scenes, std::optional<Seconds> timeout = {}) {
     return call("POST", "/rooms/batch", {{"scenes", scenes}}, timeout);
+  }
+  json where_batch(const json& scenes, std::optional<Seconds> timeout = {}) {
+    return call("POST", "/where/batch", {{"scenes", scenes}}, timeout);
   }
 
   // List models, versions and aliases.

@@ -1,6 +1,6 @@
 """Measure the doubt about detections on scenes that the model has never seen.
 
-    python -m scripts.sense.doubt MODEL FILE... [--store model_store] [--scenes 1000]
+    python -m scripts.sense.doubt MODEL FILE... [--store model_store] [--scenes 1000] [--kept-out]
 
 Each FILE has scenes with labels (`training.datasets.read_scenes`). A model of detectors sees them
 (`training.datasets.detections`). Printed are, for each file:
@@ -9,6 +9,7 @@ Each FILE has scenes with labels (`training.datasets.read_scenes`). A model of d
   against ghosts and swapped labels; and the ratio of both distances from 1.
 - MRR of a removed class, and the share of right room types: of the rest of the scene, and with one
   intruder listed, with and without its doubt. The loss is the difference to the scene without it.
+- the shares of single rooms, and of all rooms of a home together, with `several-rooms`.
 - swapped labels with the true label as alternative, both with confidences of a swapped label: the
   share for which the detector, and the service, prefers the true one; the same for right labels.
 """
@@ -16,7 +17,7 @@ Each FILE has scenes with labels (`training.datasets.read_scenes`). A model of d
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -28,19 +29,20 @@ from sklearn.metrics import roc_auc_score
 
 from app.model import SceneModel
 from app.questions.alternatives import Guesses, label_probabilities
-from app.questions.doubt import believed, doubt
+from app.questions.doubt import believed, doubt, room_log_p
 from app.questions.posterior import Posterior
+from app.questions.several_rooms import several_rooms
 from app.registry import Store
 from training.datasets import EncodedScene, encode, read_scenes
 from training.datasets.cases import scene_rng
 from training.datasets.detections import GHOST, Detector
+from training.datasets.homes import homes_of
+from training.datasets.splits import split
 from training.datasets.vocabulary import plain_scenes
 from training.evaluation.parts import of_classes
 from training.fit.calibrate_doubt import detector_of, seen_scene
 
 _SEED: Final = 11
-
-Ask = Callable[[SceneModel, Sequence[int]], Posterior]
 
 
 def auc(model: SceneModel, scenes: Sequence[EncodedScene], detector: Detector) -> None:
@@ -73,8 +75,6 @@ def intruders(model: SceneModel, scenes: Sequence[EncodedScene], detector: Detec
     """Print how much an intruder takes from the answers, with and without its doubt."""
     vocabulary = model.vocabulary
     laws = {"by popularity": detector.share, "uniform": (detector.share > 0) / 1.0}
-    plain: Ask = lambda model, listed: Posterior(model, of_classes(listed))  # noqa: E731
-    doubted: Ask = lambda model, listed: believed(model, of_classes(listed))  # noqa: E731
     for law, share in laws.items():
         ranks, rooms = list[list[float]](), list[list[bool]]()
         for encoded in scenes:
@@ -89,12 +89,13 @@ def intruders(model: SceneModel, scenes: Sequence[EncodedScene], detector: Detec
             intruder = int(rng.choice(len(p), p=p / p.sum()))
             if vocabulary.related[[*listed, intruder], hidden].any():
                 continue
-            asked = ((plain, listed), (plain, [*listed, intruder]), (doubted, [*listed, intruder]))
-            posteriors = [ask(model, sorted(names)) for ask, names in asked]
-            ranks.append([1 / _rank(model, one, hidden) for one in posteriors])
+            lists = of_classes(listed), of_classes(sorted([*listed, intruder]))
+            without, raw = (Posterior(model, scene) for scene in lists)
+            doubted = believed(model, lists[1])
+            ranks.append([1 / _rank(model, one, hidden) for one in (without, raw, doubted)])
             if encoded.room_type >= 0:
-                best = [int(one.room_log_p().argmax()) for one in posteriors]
-                rooms.append([one == encoded.room_type for one in best])
+                tables = without.room_log_p(), raw.room_log_p(), room_log_p(model, lists[1])[1]
+                rooms.append([int(table.argmax()) == encoded.room_type for table in tables])
         for name, values in (("MRR", ranks), ("room", rooms)):
             _print_loss(f"{name}, intruder {law}", np.array(values, float))
 
@@ -138,6 +139,22 @@ def labels(model: SceneModel, scenes: Sequence[EncodedScene], detector: Detector
         print(f"  {name} labels: detector {shares[0]:.3f}, decided {shares[1]:.3f}, n {kept.sum()}")
 
 
+def rooms(model: SceneModel, scenes: Sequence[EncodedScene], _: Detector) -> None:
+    """Print the shares of single rooms and of whole homes with the warning `several-rooms`."""
+    structure = model.vocabulary.structure
+
+    def is_warned(parts: Sequence[EncodedScene]) -> bool:
+        classes = np.concatenate([part.instance_classes for part in parts])
+        return bool(several_rooms(model, of_classes(classes[~structure[classes]].tolist())))
+
+    homes = homes_of(scenes)
+    single = np.mean([is_warned([scene]) for scene in scenes])
+    print(f"  several rooms: {single:.3f} of {len(scenes)} rooms warned", end="")
+    if homes:
+        print(f", {np.mean([is_warned(home) for home in homes]):.3f} of {len(homes)} homes", end="")
+    print()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -146,15 +163,22 @@ def main() -> None:
     parser.add_argument("files", type=Path, nargs="+")
     parser.add_argument("--store", type=Path, default=Path("model_store"))
     parser.add_argument("--scenes", type=int, default=1000)
+    parser.add_argument("--kept-out", action="store_true", help="leave training scenes out")
     options = parser.parse_args()
     store = Store(options.store)
     model = store.load(*store.resolve(options.model)).model
     detector = detector_of(model)
     for path in options.files:
-        read, _ = plain_scenes([replace(one, source=path.stem) for one in read_scenes(path)])
+        name = path.name.split(".")[0]
+        read, _ = plain_scenes([replace(one, source=name) for one in read_scenes(path)])
+        if options.kept_out:
+            parts = (split(read, seed=0, protocol=protocol) for protocol in ("final", "group"))
+            trained = {one.scene_id for part in parts for one in part["train"]}
+            read = [one for one in read if one.scene_id not in trained]
         scenes = encode(read, model.vocabulary)
         kept = np.random.default_rng(_SEED).permutation(len(scenes))[: options.scenes]
         print(path.name)
+        rooms(model, scenes, detector)
         for measure in (auc, intruders, labels):
             measure(model, [scenes[k] for k in kept.tolist()], detector)
 

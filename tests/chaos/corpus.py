@@ -46,6 +46,7 @@ SCENE: Final[dict[str, Any]] = {
             "id": "lamp_1",
             "label": "lamp",
             "confidence": 0.9,
+            "alternatives": [{"label": "pillow", "confidence": 0.05}],
             "position": {"x": 1.0, "y": 0.5, "z": 1.0},
             "size": {"x": 0.2, "y": 0.2, "z": 0.4},
             "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
@@ -83,7 +84,12 @@ SCENE: Final[dict[str, Any]] = {
 
 
 # Values in place of those in the examples: few steps, and labels of the tests' vocabulary.
-_VALUES: Final[dict[str, Any]] = {"candidates": ["chair", "table"], "count": 1, "steps": 2}
+_VALUES: Final[dict[str, Any]] = {
+    "candidates": ["chair", "table"],
+    "count": 1,
+    "steps": 2,
+    "top_k": 5,
+}
 
 
 def own_fields(question: Question[Any]) -> dict[str, Any]:
@@ -97,7 +103,11 @@ def own_fields(question: Question[Any]) -> dict[str, Any]:
 
 
 VALID: Final[dict[str, dict[str, Any]]] = {
-    f"/{question.name}": SCENE | own_fields(question) for question in QUESTIONS
+    f"/{question.name}": {
+        name: value for name, value in SCENE.items() if name in question.request.model_fields
+    }
+    | own_fields(question)
+    for question in QUESTIONS
 }
 """One request of each kind with every field that it may have."""
 

@@ -44,10 +44,12 @@ int main(int, char** argv) {
       if (method == "outliers") answer = service.outliers(request, timeout);
       if (method == "rooms") answer = service.rooms(request, timeout);
       if (method == "generate") answer = service.generate(request, timeout);
+      if (method == "where") answer = service.where(request, timeout);
       if (method == "relations_batch") answer = service.relations_batch(request, timeout);
       if (method == "missing_batch") answer = service.missing_batch(request, timeout);
       if (method == "outliers_batch") answer = service.outliers_batch(request, timeout);
       if (method == "rooms_batch") answer = service.rooms_batch(request, timeout);
+      if (method == "where_batch") answer = service.where_batch(request, timeout);
       if (method == "models") answer = service.models(timeout);
       if (method == "is_ready") answer = service.is_ready(timeout);
       said = {{"outcome", "answer"}, {"answer", answer}};

@@ -41,12 +41,20 @@ def _plain(answer: Any) -> Any:
     return json.loads(answer.model_dump_json(exclude_unset=True)) if is_model else answer
 
 
+def _asked(client: Any, method: str, request: tuple[Any, ...], timeout: float | None) -> Any:
+    """Call a method with a request as JSON. `where` takes label and rooms, not a whole request."""
+    fields = {"timeout": timeout}
+    if method == "where":
+        return client.where(**request[0], **fields)
+    return getattr(client, method)(*request, **fields)
+
+
 @contextmanager
 def sync_caller(place: Any, kind: type[Client] = Client, **options: Any) -> Iterator[Caller]:
     """`Client` at a URL, or `OfflineClient` with a store."""
     with kind(place, **{"timeout": LONG, **options}) as client:
         yield lambda method, *request, timeout=None: _plain(
-            getattr(client, method)(*request, timeout=timeout)
+            _asked(client, method, request, timeout)
         )
 
 
@@ -57,7 +65,7 @@ def async_caller(url: str, **options: Any) -> Iterator[Caller]:
         client = AsyncClient(url, **{"timeout": LONG, **options})
         try:
             yield lambda method, *request, timeout=None: _plain(
-                runner.run(getattr(client, method)(*request, timeout=timeout))
+                runner.run(_asked(client, method, request, timeout))
             )
         finally:
             runner.run(client.close())

@@ -59,6 +59,19 @@ def test_each_scene_of_a_batch_has_its_answer_or_problem(caller: Caller, live: L
 
 
 @every_client
+def test_each_question_of_a_batch_about_homes_has_its_answer_or_problem(
+    caller: Caller, live: LiveService
+) -> None:
+    rooms = [{"id": "bedroom", "objects": ["bed"]}, {"id": "room_2", "room_type": "office"}]
+    homes = [{"label": label, "rooms": rooms} for label in ("lamp", "nonsuch", "bed")]
+    found = caller("where_batch", homes)["results"]
+    assert [entry["status"] for entry in found] == [200, 422, 200]
+    assert found[1]["problem"]["errors"][0]["pointer"] == "#/scenes/1/label"
+    assert _same(found[0]["result"], live.client.post("/where", json=homes[0]).json())
+    assert found[2]["result"]["places"][0]["is_listed"]
+
+
+@every_client
 def test_unknown_labels_are_a_problem(caller: Caller) -> None:
     with pytest.raises(ProblemError) as raised:
         caller("missing", {"objects": ["nightstnad", *(f"nonsuch {n}" for n in range(11))]})

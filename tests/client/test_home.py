@@ -15,6 +15,7 @@ from scene_client import (
     ProblemError,
     Settings,
     UnreachableError,
+    rooms_from_file,
 )
 from tests.client.homes import FakeClient, thing
 from tests.conftest import REPOSITORY, run_program
@@ -247,6 +248,20 @@ def test_questions_about_the_home(client):
         one.update([], (0.0, 0.0, turn * math.pi / 4), 40.0 + turn)
     assert one.coverage("kitchen") == pytest.approx(0.9)
     assert one.coverage("area 2") < 0.3
+
+
+def test_the_file_of_a_home_has_the_rooms_of_its_question(client, tmp_path):
+    one = home(client, path=tmp_path / "home.json")
+    run(one, range(20), KITCHEN)
+    run(one, range(20, 40), [thing("bed", 8.0), thing("lamp", 9.0, 1.0)], BESIDE)
+    one.where("medicine")
+    one.close()
+    (where,) = client.questions("where")
+    fields = rooms_from_file(tmp_path / "home.json")
+    assert fields["rooms"] == where["objects"]
+    assert len(fields["rooms"][0]["objects"]) == 3
+    others = {name: where[name] for name in ("frame_id", "unknown_labels")}
+    assert fields == {"rooms": where["objects"], **others}
 
 
 def test_a_real_service(url: str) -> None:

@@ -28,7 +28,17 @@ from scene_client.calls import LONGEST_PAUSE
 from scene_client.command import app
 from scene_client.connection import RETRIES
 from scene_client.errors import problem_of
-from scene_client.schemas import Anchor, Detection, MissingRequest, Position, Relation, SceneRequest
+from scene_client.schemas import (
+    Anchor,
+    Detection,
+    HomeRoom,
+    MissingRequest,
+    Position,
+    Relation,
+    SceneRequest,
+    Searched,
+    WhereRequest,
+)
 
 Received = tuple[int, dict[str, str], bytes]
 Outcome = Received | Exception
@@ -220,7 +230,9 @@ EVERYTHING: dict[str, Any] = {
     "request_id": "r",
     "seed": 1,
     **{key: [] for key in ("relations", "disagreements", "missing", "outliers", "misplaced")},
-    **{key: [] for key in ("scenes", "results")},
+    **{key: [] for key in ("scenes", "results", "places", "rooms")},
+    "label": "lamp",
+    "not_here": 1.0,
 }
 """An answer to every question."""
 
@@ -251,6 +263,9 @@ def test_short_and_long_forms_are_sent_alike(scene: Client, service: World) -> N
 
 
 LAMPS = {"objects": ["bed"], "candidates": ["lamp"]}
+ROOMS = [
+    {"id": "bedroom", "objects": ["bed", {"label": "desk", "position": {"x": 1, "y": 2, "z": 0}}]}
+]
 
 
 @pytest.mark.parametrize(
@@ -274,6 +289,37 @@ LAMPS = {"objects": ["bed"], "candidates": ["lamp"]}
             "missing/batch",
             {"scenes": [{"objects": ["bed"]}, LAMPS, {"objects": ["desk"]}]},
         ),
+        (lambda scene: scene.where("lamp", ROOMS), "where", {"label": "lamp", "rooms": ROOMS}),
+        (
+            lambda scene: scene.where(
+                "lamp",
+                (HomeRoom(id="7", room_type="office"), {"id": 8, "objects": ("bed",)}),
+                searched=[Searched(room="7"), {"room": "8", "object": "bed", "seen_share": 0.5}],
+                top_k=3,
+            ),
+            "where",
+            {
+                "label": "lamp",
+                "rooms": [{"id": "7", "room_type": "office"}, {"id": "8", "objects": ["bed"]}],
+                "searched": [{"room": "7"}, {"room": "8", "object": "bed", "seen_share": 0.5}],
+                "top_k": 3,
+            },
+        ),
+        (
+            lambda scene: scene.where_batch(
+                [
+                    WhereRequest(label="lamp", rooms=[HomeRoom(id="a")]),
+                    {"label": "bed", "rooms": ROOMS},
+                ]
+            ),
+            "where/batch",
+            {
+                "scenes": [
+                    {"label": "lamp", "rooms": [{"id": "a"}]},
+                    {"label": "bed", "rooms": ROOMS},
+                ]
+            },
+        ),
     ],
 )
 def test_scenes_of_every_form(scene, service, ask, path, body):
@@ -292,6 +338,10 @@ def test_the_model_of_the_client_is_the_default(service: World) -> None:
     assert service.body["model"] == "home"
     scene.relations_batch([["bed"], {"objects": ["bed"], "model": "home"}])
     assert [entry["model"] for entry in service.body["scenes"]] == ["plain", "home"]
+    scene.where("lamp", ROOMS)
+    assert service.body["model"] == "plain"
+    scene.where_batch([{"label": "lamp", "rooms": ROOMS, "model": "home"}])
+    assert service.body["scenes"][0]["model"] == "home"
 
 
 @pytest.mark.parametrize(
@@ -304,6 +354,14 @@ def test_the_model_of_the_client_is_the_default(service: World) -> None:
         (lambda scene: scene.missing(SceneRequest(objects=["bed"]), top_k=1), "#", "top_k"),
         (lambda scene: scene.missing_batch([["bed"], []]), "#/scenes/1/objects", "empty"),
         (lambda scene: scene.missing_batch([]), "#/scenes", "256"),
+        (lambda scene: scene.where("lamp", []), "#/rooms", "empty"),
+        (lambda scene: scene.where("lamp", [{"name": "a"}]), "#/rooms/0/name", "id"),
+        (
+            lambda scene: scene.where_batch([{"label": "a", "rooms": ROOMS}, {"rooms": ROOMS}]),
+            "#/scenes/1/label",
+            "required",
+        ),
+        (lambda scene: scene.where_batch([]), "#/scenes", "256"),
         (lambda scene: scene.missing(["bed"], timeout=0.0), "#", "timeout"),
         (lambda scene: scene.vocabulary(".."), "#", "name"),
         (lambda scene: scene.model("home", ""), "#", "name"),

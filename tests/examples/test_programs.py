@@ -45,17 +45,18 @@ def test_the_readme_lists_every_program() -> None:
             )
 
 
-def test_curl_asks_the_five_questions(shipped: LiveService, find_tool: FindTool) -> None:
+def test_curl_asks_the_six_questions(shipped: LiveService, find_tool: FindTool) -> None:
     find_tool("curl")
     lines = run(find_tool("bash"), "curl.sh", url=shipped.url).stdout.splitlines()
     answers = dict(zip(lines[::2], map(json.loads, lines[1::2]), strict=True))
-    assert list(answers) == ["relations", "missing", "outliers", "rooms", "generate"]
+    assert list(answers) == ["relations", "missing", "outliers", "rooms", "generate", "where"]
     assert answers["relations"]["relations"][0]["relation"] == "on-top"
     assert "lamp" in {thing["label"] for thing in answers["missing"]["missing"]}
     wrong = [thing["object"] for thing in answers["outliers"]["outliers"] if thing["is_outlier"]]
     assert wrong == ["toilet"]
     assert answers["rooms"]["room_types"][0]["room_type"] == "bathroom"
     assert {"desk", "bed"} <= set(answers["generate"]["scenes"][0]["objects"])
+    assert answers["where"]["rooms"][0]["room"] == "bathroom"
 
 
 def test_the_python_program_asks_and_branches_on_errors(shipped: LiveService) -> None:
@@ -68,6 +69,7 @@ def test_the_python_program_asks_and_branches_on_errors(shipped: LiveService) ->
     assert values["outliers"] == "['toilet']"
     assert values["room"] == "office"
     assert "desk" in values["a whole room"]
+    assert values["the toothbrush"].startswith("bathroom")
     assert "nightstand" in values["unknown label at #/objects/1"]
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from app.model import RealFit
 from app.model.calibration import CountSlope
-from app.questions.doubt import believed, doubt
+from app.questions.doubt import PRIOR, believed, doubt, room_log_p
 from app.questions.posterior import Posterior
 from app.scene import Scene
 from tests.questions.answers import misplaced, missing, outliers, rooms
@@ -160,3 +160,28 @@ def test_doubt_reduces_the_reasons():
         for reason in one.because if reason.object == 2
     ]  # fmt: skip
     assert len(effects) < 2 or effects[1] < effects[0]
+
+
+@pytest.mark.parametrize("name", [name for name, spec in LARGER.items() if spec.C])
+def test_the_room_type_is_a_mixture_over_the_intruder(name):
+    """Of five classes, the least probable intruder has no hypothesis."""
+    artifact = doubting(name)
+    classes = [0, 1, 3, 5, 6]
+    posterior = Posterior(artifact, scene_of(classes))
+    logits = doubt(artifact, posterior, posterior.given_rest()[0]).logits
+    least = int(logits.argmin())
+    p, total = np.exp(posterior.room_log_p()), 1.0
+    for row, index in enumerate(classes):
+        if row != least:
+            others = [one for one in classes if one != index]
+            weight = math.exp(logits[row] + PRIOR)
+            p = p + weight * np.exp(Posterior(artifact, scene_of(others)).room_log_p())
+            total += weight
+    _, log_p = room_log_p(artifact, scene_of(classes, room=1))
+    assert np.exp(log_p) == pytest.approx(p / total, rel=2e-3)
+
+
+def test_the_room_type_of_a_single_class_is_that_of_the_machine():
+    artifact = doubting(outlier=CountSlope(intercept=200.0))
+    log_p = room_log_p(artifact, scene_of([0]))[1]
+    assert log_p == pytest.approx(Posterior(artifact, scene_of([0])).room_log_p(), rel=1e-5)

@@ -21,6 +21,7 @@ from torch import Tensor
 from app import questions
 from app.inference.elementary import log_softmax
 from app.model import SceneModel, Sensitivity
+from app.questions.doubt import believed, room_log_p
 from app.questions.misplaced import wrong_relations
 from app.questions.posterior import Posterior, calibrated_missing
 from app.scene import CANONICAL, OPPOSITES, RelationTable, Scene, SceneObject, canonicalise, observe
@@ -127,7 +128,7 @@ def missing_log_p(artifact: SceneModel, scene: Scene) -> Float[NDArray, " V"]:
 
     All classes are candidates, so a class has a value beside a likelier one of its family.
     """
-    posterior, vocabulary = Posterior(artifact, scene), artifact.vocabulary
+    posterior, vocabulary = believed(artifact, scene), artifact.vocabulary
     listed, calibration = posterior.present.classes, artifact.calibration
     raw = posterior.absent_log_odds(np.arange(len(vocabulary)), calibration.coverage)
     log_odds = calibrated_missing(calibration, raw.astype(np.float64), posterior.listed, None)
@@ -180,9 +181,9 @@ def score_rooms(
     index = profiles.index(profile) if profile in profiles else None
     log_p = np.zeros((len(v), artifact.spec.C))
     for row, scene in zip(log_p, _scenes(v), strict=True):
-        posterior = Posterior(artifact, replace(scene, profile=index))
+        posterior, of_types = room_log_p(artifact, replace(scene, profile=index))
         sharpness = artifact.calibration.rooms.of(posterior.listed)  # exponent of p
-        row[:] = log_softmax(sharpness * posterior.room_log_p())
+        row[:] = log_softmax(sharpness * of_types)
     return torch.from_numpy(log_p)
 
 

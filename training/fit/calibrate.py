@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from app.inference.elementary import NO_UNIT
 from app.model import Calibration, CountSlope, SceneModel
+from app.questions.doubt import believed
 from app.questions.placements import PLACES
 from app.questions.posterior import Posterior
 from app.scene.spatial_relations import CANONICAL, LATERAL, ON_TOP, STACKED
@@ -228,7 +229,8 @@ def fit_placements(
             continue
         target, kept = removal
         instance = int(rng.choice(np.flatnonzero(encoded.instance_classes == target)))
-        posterior = _posterior(artifact, encoded, kept)
+        scene = replace(scene_of(encoded, kept, ()), room_type=None)
+        posterior = believed(artifact, scene)
         present = posterior.present
         anchors = np.flatnonzero(~structure[present.classes])
         tables = posterior.units.placement_log_odds(posterior.context, np.array([target]), anchors)

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from app.model import PlaceFit, SceneModel
+from app.questions.doubt import believed
 from app.questions.placements import place_log_p
-from app.questions.posterior import Posterior, calibrated_missing
+from app.questions.posterior import calibrated_missing
 from app.scene.spatial_relations import LATERAL, STACKED
 from training.datasets import EncodedScene
 from training.evaluation.calibration_task import PlaceQuestion, place_question
@@ -61,7 +62,7 @@ def fit_at(
 def place_terms(artifact: SceneModel, question: PlaceQuestion) -> PlaceTerms:
     """Return the terms of the candidate classes at a place."""
     scene, place, is_there, usable = question
-    posterior, classes = Posterior(artifact, scene), np.flatnonzero(usable)
+    posterior, classes = believed(artifact, scene), np.flatnonzero(usable)
     log_odds = posterior.absent_log_odds(classes, artifact.calibration.coverage).astype(np.float64)
     counts = np.zeros(len(classes))
     if artifact.places is not None:

@@ -26,7 +26,7 @@ from torch import Tensor
 from app.inference.chains import random_stream
 from app.model import FitLimit, SceneModel, Sharpness
 from app.model.calibration import NO_LIMIT
-from app.questions.doubt import believed
+from app.questions.doubt import believed, room_log_p
 from app.questions.generate import STEPS, room_fit
 from app.questions.posterior import Posterior
 from app.questions.several_rooms import LEAST_CLASSES, gain
@@ -74,7 +74,7 @@ def fit_rooms(artifact: SceneModel, scenes: SceneTensors) -> Sharpness:
     parts = [draw_parts(scenes, structure_of(artifact), size) for size in sizes]
     v = torch.cat([part.v for part in parts])
     room = torch.cat([scenes.room[part.scene] for part in parts]).numpy()
-    log_p = np.stack([posterior_of(artifact, row).room_log_p() for row in v])
+    log_p = np.stack([room_log_p(artifact, listed_scene(row))[1] for row in v])
     size = np.log(v.sum(1).numpy())
 
     def loss(weights: NDArray[np.float64]) -> float:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
         ProblemError,
         UnreachableError,
     )
-    from scene_client.files import from_file
+    from scene_client.files import from_file, rooms_from_file
     from scene_client.formats import from_data
     from scene_client.home import Home
     from scene_client.home_state import Event
@@ -33,7 +33,7 @@ __version__ = "2.0.0"
 __all__ = [
     "AnswerError", "AsyncClient", "Client", "ClientError", "DeadlineError", "Event", "Home",
     "HomeFileError", "InvalidRequestError", "OfflineClient", "ProblemError", "Recorder", "Settings",
-    "UnreachableError", "from_data", "from_file",
+    "UnreachableError", "from_data", "from_file", "rooms_from_file",
 ]  # fmt: skip
 
 # Maps each name to the module that defines the name. The package imports the module on first use of
@@ -41,7 +41,7 @@ __all__ = [
 _MODULES = {
     "AsyncClient": "asynchronous", "Client": "sync", "Event": "home_state", "Home": "home",
     "OfflineClient": "offline", "Recorder": "recorder", "Settings": "tracks",
-    "from_data": "formats", "from_file": "files",
+    "from_data": "formats", "from_file": "files", "rooms_from_file": "files",
 }  # fmt: skip
 
 

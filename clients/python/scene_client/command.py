@@ -25,11 +25,12 @@ from scene_client import __version__, tables
 from scene_client.errors import (
     ClientError,
     DeadlineError,
+    HomeFileError,
     InvalidRequestError,
     ProblemError,
     UnreachableError,
 )
-from scene_client.files import from_file, is_file, label_map_of
+from scene_client.files import from_file, is_file, label_map_of, rooms_from_file
 from scene_client.formats import from_data
 from scene_client.frames import CONVENTIONS, BoxOrigin, Extents, QuaternionOrder, Units, Up
 from scene_client.offline import OfflineClient
@@ -75,7 +76,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     help="Ask which objects are missing from a scene, which do not belong, how they relate, and "
-    "which room it is.",
+    "which room it is. Or ask where in a home a thing is.",
     epilog="The options above may also follow the subcommand. Exit status: 1 request refused, "
     "2 wrong usage, 3 service not reached, 4 answer too late, 5 service busy or not ready, "
     "6 other error.",
@@ -361,6 +362,45 @@ def generate(
     _show(context, lambda client: client.generate(request), tables.generate)
 
 
+@app.command()
+def where(
+    context: typer.Context,
+    label: Annotated[str, typer.Argument(help="Label of the wanted thing.")],
+    file: Annotated[
+        str,
+        typer.Argument(
+            metavar="FILE | -",
+            help="JSON file with the rooms of the home, or - for standard input: the file of a "
+            'Home, a request, a list of rooms, or an object such as {"kitchen": ["fridge"]}.',
+            show_default=False,
+        ),
+    ] = "",
+    searched: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ROOM[:OBJECT[:SHARE]]",
+            help="Place where the robot has looked without success, such as bathroom:sink_1, and "
+            "the share of it that the robot has seen; repeatable.",
+        ),
+    ] = None,
+    top_k: TopK = None,
+    unknown_labels: Unknown = None,
+) -> None:
+    """List the likely rooms and places of one thing in a home."""
+    if not file:
+        _fail("the rooms are missing: give a JSON file, or - for stdin")
+    try:
+        fields = rooms_from_file(file)
+    except (MessageError, HomeFileError) as error:
+        _fail(str(error))
+    general: Options = context.obj
+    places = [_search(text) for text in searched or ()]
+    fields |= general.conventions | _named(top_k=top_k, unknown_labels=unknown_labels)
+    if places:
+        fields["searched"] = [*fields.get("searched", ()), *places]
+    _show(context, lambda client: client.where(label, **fields), tables.where)
+
+
 # ------------------------------------------------------------------------------------- models
 
 
@@ -435,6 +475,15 @@ def _anchor(text: str) -> dict[str, str]:
         rule = '--at must be a relation and an object, such as "on-top desk"'
         _fail(f"{rule}; {_relations_for([relation])}")
     return {"relation": relation, "object": object.strip()}
+
+
+def _search(text: str) -> dict[str, Any]:
+    room, _, place = text.partition(":")
+    name, _, share = place.partition(":")
+    try:
+        return {"room": room} | _named(object=name or None, seen_share=float(share or 1))
+    except ValueError:
+        _fail(f"--searched must be ROOM, ROOM:OBJECT or ROOM:OBJECT:SHARE, and not {text}")
 
 
 def _relation(text: str) -> dict[str, str]:

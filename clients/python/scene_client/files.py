@@ -13,6 +13,7 @@ from typing import Any, Final
 from xml.etree import ElementTree
 
 from scene_client.formats import Reader, chosen, from_data, scenes_in
+from scene_client.home_state import FORMAT, state_of
 from scene_client.image_formats import Lines
 from scene_client.ros_fields import WELL_KNOWN, LabelMap, MessageError, read_label_map
 from scene_client.vision_msgs import SceneFields
@@ -96,6 +97,51 @@ def scenes_of(content: bytes, name: str, label_map: LabelMap | None = None) -> d
 
 def _read_line(line: str, label_map: LabelMap | None) -> SceneFields:
     return from_data(_parsed(line), label_map)
+
+
+def rooms_from_file(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read a file with the rooms of a home. Return the fields of a `where` request without a label.
+
+    ``client.where("medicine", **rooms_from_file("home.json"))`` asks about the rooms.
+
+    Args:
+        path: name of a JSON file, or ``-`` for standard input. It is the file of a `Home`; or a
+            request; or its rooms, as a list or as a mapping from their names to their objects.
+
+    Raises:
+        MessageError: the file cannot be read, or it does not contain rooms.
+        HomeFileError: the file of a `Home` is damaged, or of a newer version.
+    """
+    name = os.fspath(path)
+    content = _bytes(name)
+    try:
+        return _rooms_in(_parsed(_text(content)), name)
+    except MessageError as error:
+        raise MessageError(f"{name}: {error}") from None
+
+
+def _rooms_in(data: Any, name: str) -> dict[str, Any]:
+    if isinstance(data, dict) and data.get("format") == FORMAT:
+        return state_of(data, name).where_fields()
+    if isinstance(data, dict) and "rooms" in data:
+        fields = {key: value for key, value in data.items() if key != "label"}
+    else:
+        fields = {"rooms": data}
+    rooms = fields["rooms"]
+    if isinstance(rooms, dict):
+        rooms = [_room(key, content) for key, content in rooms.items()]
+    if not isinstance(rooms, list) or not all(isinstance(room, dict) for room in rooms):
+        raise MessageError(
+            "this has no rooms: it must be a request of /where, a list of its rooms, or a JSON "
+            'object such as {"kitchen": ["fridge", "stove"]}'
+        )
+    return fields | {"rooms": rooms}
+
+
+def _room(name: str, content: Any) -> Any:
+    if isinstance(content, list):
+        return {"id": name, "objects": content}
+    return {"id": name, **content} if isinstance(content, dict) else content
 
 
 def label_map_of(option: str) -> dict[str, str | None]:

@@ -15,7 +15,17 @@ from typing_extensions import Self
 
 from scene_client import schemas
 from scene_client.errors import ClientError, InvalidRequestError
-from scene_client.home_state import Event, Kind, Room, State, inside, read_state, write_state
+from scene_client.home_state import (
+    MOST_THINGS,
+    UNKNOWN,
+    Event,
+    Kind,
+    Room,
+    State,
+    inside,
+    read_state,
+    write_state,
+)
 from scene_client.recorder import Recorder
 from scene_client.tracks import (
     Frame,
@@ -39,7 +49,6 @@ LIKELY: Final = 0.2  # probability of existence from which a thing is evidence f
 MARGIN: Final = 0.1  # difference of probabilities from which another room type is likelier
 LOST_TIMEOUT: Final = 0.3  # seconds of a try while the service is lost
 FIRST_PAUSE, LONGEST_PAUSE = 2.0, 30.0  # seconds between tries; the pause doubles each time
-UNKNOWN: Final = "nearest-or-ignore"
 
 _logger: Final = logging.getLogger(__name__)
 
@@ -259,11 +268,8 @@ class Home:
     def room_type(self, room: str | None = None) -> str | None:
         """Return the type of a room, by default of the robot's room, or else the likeliest one."""
         name = self.room if room is None else room
-        return self._settled_type(name) or self._rooms.get(name, Room()).best
-
-    def _settled_type(self, name: str) -> str | None:
-        room = self._rooms.get(name, Room())
-        return name if room.is_named else room.type.value
+        known = self._rooms.get(name, Room())
+        return known.settled_type(name) or known.best
 
     def coverage(self, room: str | None = None) -> float:
         """Return the share of a room that the robot has seen, from .2 at first sight to .9."""
@@ -280,11 +286,13 @@ class Home:
         if any("position" in one for one in objects):
             scene["frame_id"] = "map"
             if self._pose is not None:
-                at = plus(self._pose, self._tracks.shift)
-                scene["viewpoint"] = dict(zip(("x", "y", "yaw"), at, strict=True))
+                scene["viewpoint"] = self._viewpoint(self._pose)
         if room and self._rooms.get(room, Room()).is_named is not False:
             scene["room_type"] = room
         return scene
+
+    def _viewpoint(self, pose: Vector) -> dict[str, float]:
+        return dict(zip(("x", "y", "yaw"), plus(pose, self._tracks.shift), strict=True))
 
     def _things(self, room: str, exists: float | None = None) -> list[Track]:
         """Return the most certain (present) things of a room, or without rooms of those nearby."""
@@ -296,7 +304,7 @@ class Home:
             and (one.is_confirmed if exists is None else one.exists >= exists)
             and (not here or not one.place or math.dist(one.place[:2], here[:2]) <= NEAR)
         ]
-        return sorted(found, key=lambda one: -one.confidence)[:256]
+        return sorted(found, key=lambda one: -one.confidence)[:MOST_THINGS]
 
     def missing(self, room: str | None = None, **fields: Any) -> schemas.MissingAnswer:
         """Ask which things a room lacks. Other fields are those of `Client.missing`."""
@@ -307,17 +315,10 @@ class Home:
         self, label: str, searched: Iterable[schemas.Searched | schemas.Body] = (), **fields: Any
     ) -> schemas.WhereAnswer:
         """Ask where in the home a thing is. Other fields are those of `Client.where`."""
-        rooms, common = [], {"searched": list(searched), "unknown_labels": UNKNOWN}
-        for name in self._rooms:
-            if not (things := self._things(name)) and not name:
-                continue
-            scene = self._scene(things, name)
-            room = {"id": name or "here", "objects": scene["objects"]}
-            if (kind := self._settled_type(name)) is not None:
-                room["room_type"] = kind
-            rooms.append(room | {"coverage": self._rooms[name].coverage})
-            common |= {one: scene[one] for one in ("frame_id", "viewpoint") if one in scene}
-        return self.client.where(label, rooms, **{**common, **fields})
+        home = self._state.where_fields() | {"searched": list(searched)}
+        if self._pose is not None and "frame_id" in home:
+            home["viewpoint"] = self._viewpoint(self._pose)
+        return self.client.where(label, **{**home, **fields})
 
     def confirm(self, track_id: str) -> list[Event]:
         """State that a thing belongs where it is. Return the alarms that this clears.
@@ -336,7 +337,7 @@ class Home:
                 events.append(self._event("cleared", one, self._now, former))
         if self._recorder is not None:
             quiet = [one for one in self._things(track.room) if one.alarm.value is None]
-            kind = self._settled_type(track.room)
+            kind = self._rooms.get(track.room, Room()).settled_type(track.room)
             scene = self._scene(quiet, track.room) | {"confirmed": True, "room_type": kind}
             self._recorder.confirm(schemas.SceneRequest.model_validate(scene))
         return events
@@ -351,11 +352,14 @@ class Home:
         """
         if (target := path or self.path) is None:
             raise ValueError("the home has no file: name a path")
+        write_state(self._state, Path(target))
+
+    @property
+    def _state(self) -> State:
         now, tracks = self._now if math.isfinite(self._now) else None, self._tracks
-        state = State(
+        return State(
             now, self.room, tracks.shift, tracks.count, self.confirmed, self._rooms, tracks.all
         )
-        write_state(state, Path(target))
 
     def _resume(self, state: State) -> None:
         self.room, self.confirmed = state.room, state.habits

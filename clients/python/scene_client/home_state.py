@@ -8,14 +8,17 @@ import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from pydantic import TypeAdapter
 
 from scene_client.errors import HomeFileError
 from scene_client.tracks import Latch, Point, Track, Vector
 
+FORMAT: Final = "scene-home"
 VERSION: Final = 1  # of the file
+UNKNOWN: Final = "nearest-or-ignore"  # treatment of unknown labels
+MOST_THINGS: Final = 256  # of a room in a request
 HEADINGS, LOOKS = 8, 30  # directions, or looks without poses, that show a whole room
 
 Kind = Literal[
@@ -60,6 +63,10 @@ class Room:
         """Share of the room that the robot has seen."""
         return 0.2 + 0.7 * min(1.0, max(len(self.headings) / HEADINGS, self.looks / LOOKS))
 
+    def settled_type(self, name: str) -> str | None:
+        """Return the type of the room with this name, if it is certain."""
+        return name if self.is_named else self.type.value
+
 
 def inside(x: float, y: float, polygon: Iterable[Point]) -> bool:
     """Return whether a polygon contains a point (even-odd rule)."""
@@ -81,8 +88,25 @@ class State:
     habits: set[tuple[str, str]] = field(default_factory=set)  # label and room
     rooms: dict[str, Room] = field(default_factory=dict)
     tracks: dict[str, Track] = field(default_factory=dict)
-    format: Literal["scene-home"] = "scene-home"
+    format: Literal["scene-home"] = FORMAT
     version: int = VERSION
+
+    def where_fields(self) -> dict[str, Any]:
+        """Return the fields of a `where` request about the present things, without a label."""
+        fields: dict[str, Any] = {"rooms": [], "unknown_labels": UNKNOWN}
+        for name, known in self.rooms.items():
+            present = [one for one in self.tracks.values() if one.is_confirmed and one.room == name]
+            if not present and not name:
+                continue
+            present.sort(key=lambda one: -one.confidence)
+            objects = [one.as_object(self.shift) for one in present[:MOST_THINGS]]
+            room = {"id": name or "here", "objects": objects, "coverage": known.coverage}
+            if (kind := known.settled_type(name)) is not None:
+                room["room_type"] = kind
+            fields["rooms"].append(room)
+            if any("position" in one for one in objects):
+                fields["frame_id"] = "map"
+        return fields
 
 
 def write_state(state: State, path: Path) -> None:
@@ -109,18 +133,36 @@ def read_state(path: Path) -> State:
         HomeFileError: the file is damaged, or of a newer version.
     """
     try:
-        text = path.read_bytes()
-        version = json.loads(text)["version"]
-        if version <= VERSION:
-            return TypeAdapter(State).validate_json(text)
+        return state_of(json.loads(path.read_bytes()), path)
     except FileNotFoundError:
         return State()
-    except (LookupError, OSError, TypeError, ValueError) as error:
-        raise HomeFileError(
-            f"{path} is not a whole file of a home ({type(error).__name__}: {error}). Restore it, "
-            "or name another file. It is left as it is."
-        ) from None
+    except (OSError, ValueError) as error:
+        if isinstance(error, HomeFileError):
+            raise
+        raise _damaged(path, error) from None
+
+
+def state_of(data: Any, path: str | os.PathLike[str]) -> State:
+    """Return the contents of the file of a home from its parsed JSON.
+
+    Raises:
+        HomeFileError: the file is damaged, or of a newer version.
+    """
+    try:
+        version = data["version"]
+        if version <= VERSION:
+            return TypeAdapter(State).validate_python(data)
+    except (LookupError, TypeError, ValueError) as error:
+        raise _damaged(path, error) from None
     raise HomeFileError(
         f"{path} has version {version}, but this client reads up to version {VERSION}. Install a "
         "newer client, or name another file. It is left as it is."
+    )
+
+
+def _damaged(path: str | os.PathLike[str], error: Exception) -> HomeFileError:
+    reason = str(error).partition("\n")[0]
+    return HomeFileError(
+        f"{path} is not a whole file of a home ({type(error).__name__}: {reason}). Restore it, or "
+        "name another file. It is left as it is."
     )

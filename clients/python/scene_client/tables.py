@@ -27,6 +27,15 @@ LIKELY_PLACE: Final = 0.25
 A table of answers about one place contains all places.
 """
 
+POSSIBLE_PLACE: Final = 0.01
+"""Minimum probability of a place in a table of the places of one thing."""
+
+_PREPOSITIONS: Final[dict[schemas.RelationName, str]] = {
+    "left": "left of", "right": "right of", "front": "in front of", "on-top": "on top of",
+    "contains": "around",
+}  # fmt: skip
+"""Words for the relations that are no prepositions."""
+
 
 def relations(answer: schemas.RelationsAnswer) -> RenderableType:
     """Return a table of relations, most probable first, and a table of disagreements."""
@@ -92,13 +101,14 @@ def outliers(answer: schemas.OutliersAnswer) -> RenderableType:
         (
             *(entry.object, _class(entry), f"{entry.probability:.3f}"),
             "" if entry.log_odds is None else f"{entry.log_odds:+.2f}",
-            "outlier" if entry.is_outlier else "",
+            f"{entry.real:.3f}" if "real" in entry.model_fields_set else "",
+            "outlier" if entry.is_outlier else entry.reason or "",
             _reasons(entry.because),
             ", ".join(entry.usually_with),
         )
         for entry in answer.outliers
     ]
-    heads = ("object", "label", "probability", "log-odds", "", "because", "usually with")
+    heads = ("object", "label", "probability", "log-odds", "real", "", "because", "usually with")
     misplaced = [
         (*_relation(entry), *(("misplaced", entry.moved or "") if entry.is_misplaced else ("", "")))
         for entry in answer.misplaced[:MOST_MISPLACED]
@@ -120,6 +130,18 @@ def rooms(answer: schemas.RoomsAnswer) -> RenderableType:
         for entry in answer.room_types
     ]
     return _table("room type", "listed as", "probability", "because", rows=rows)
+
+
+def where(answer: schemas.WhereAnswer) -> RenderableType:
+    """Return a table of the places of one thing, most probable first, and of its absence."""
+    likely = [entry for entry in answer.places if entry.probability >= POSSIBLE_PLACE]
+    others = 1.0 - answer.not_here - sum(entry.probability for entry in likely)
+    rows = [(_place(entry), f"{entry.probability:.3f}") for entry in likely]
+    if others >= POSSIBLE_PLACE:
+        rows.append(("at another place", f"{others:.3f}"))
+    rows.append(("not here", f"{answer.not_here:.3f}"))
+    title = _named(answer.label, answer.listed_as)
+    return _table("place", "probability", rows=rows, title=title)
 
 
 def generate(answer: schemas.GenerateAnswer) -> RenderableType:
@@ -166,7 +188,10 @@ def vocabulary(answer: schemas.VocabularyAnswer) -> RenderableType:
 
 
 def notes(answer: BaseModel) -> list[str]:
-    """Return one line for each mapped label and each warning of the answer."""
+    """Return one line for each mapped or resolved label, and for each warning of the answer.
+
+    The warning `several-rooms` also has one line for each room.
+    """
     if not isinstance(answer, schemas.Answer):
         return []
     mapped = [
@@ -174,11 +199,20 @@ def notes(answer: BaseModel) -> list[str]:
         f"(rule {entry.rule}, similarity {entry.similarity:.2f})"
         for entry in answer.mapped
     ]
-    warnings = [
-        ": ".join(filter(None, (entry.code, ", ".join(entry.objects), entry.message)))
-        for entry in answer.warnings
+    resolved = [
+        f"{entry.object}: {', '.join(f'{one.label} {one.probability:.2f}' for one in entry.labels)}"
+        " (as the other objects decide)"
+        for entry in answer.resolved or ()
     ]
-    return mapped + warnings
+    warnings = [
+        line
+        for entry in answer.warnings
+        for line in (
+            ": ".join(filter(None, (entry.code, ", ".join(entry.objects), entry.message))),
+            *(f"  {room.room_type}: {', '.join(room.objects)}" for room in entry.rooms or ()),
+        )
+    ]
+    return mapped + resolved + warnings
 
 
 def _table(*columns: str, rows: Sequence[Sequence[str]], title: str | None = None) -> Table:
@@ -223,6 +257,15 @@ def _relations(relations: Sequence[schemas.Relation], words: Mapping[str, str]) 
     if len(ranked) > MOST_RELATIONS:
         lines.append(f"… and {len(ranked) - MOST_RELATIONS} more")
     return "\n".join(lines)
+
+
+def _place(spot: schemas.Spot) -> str:
+    """Return a place in words, such as "bathroom: on top of sink_1"."""
+    if spot.is_listed:
+        return f"{spot.room}: seen there ({spot.object})"
+    if spot.relation is None:
+        return f"{spot.room}: elsewhere"
+    return f"{spot.room}: {_PREPOSITIONS.get(spot.relation, spot.relation)} {spot.object}"
 
 
 def _placement(placement: schemas.Placement) -> str:

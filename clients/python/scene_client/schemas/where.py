@@ -95,11 +95,11 @@ class Spot(Reply):
 
     room: str
     """id of the room"""
+    probability: Probability
     relation: RelationName | None = None
     """relation of the thing to `object`"""
     object: str | None = None
     """id of an object of the room; for a listed thing, that of the thing itself"""
-    probability: Probability
     is_listed: bool = False
     """true if the request lists the thing itself"""
     offset: Offset | None = None
