@@ -109,14 +109,14 @@ for module in package.glob("*.py"):
     compile(module.read_text("utf-8"), str(module), "exec")
 sys.path.insert(0, str(package.parent))
 from scene_client import Home
-from scene_reasoning.detections import Converter
+from scene_reasoning.detections import Converter, Transform
 from scene_reasoning.home_thread import HomeThread
 
 message = json.loads(Path("clients/ros2/detections.json").read_text("utf-8"))
 with Client(sys.argv[1], timeout=30) as client:
     assert client.missing(["bed"]).missing == asyncio.run(ask()).missing
     thread, pose = HomeThread(Home(client)), (0.0, 0.0, 0.0)
-    detections = Converter().detections(message, pose)
+    detections = Converter().detections(message, Transform())
     for second in range(4):
         thread.ask(lambda home: home.update(detections, pose, second)).result()
     things = thread.ask(Home.things).result()

@@ -65,6 +65,7 @@ class Ros:
     timers: list[tuple[float, Callable[[], None]]] = field(default_factory=list)
     spun: list[Any] = field(default_factory=list)
     warned: list[str] = field(default_factory=list)
+    transforms: dict[str, Any] = field(default_factory=dict)  # from these frames to the map
     destroyed: bool = False
 
     def node_type(self) -> type:
@@ -105,6 +106,10 @@ class Ros:
 
         return Node
 
+    def _look_up(self, target: str, source: str, at: Any, timeout: Any) -> Any:
+        assert target == "map"
+        return SimpleNamespace(transform=self.transforms[source])
+
     def modules(self) -> dict[str, Any]:
         names = {
             "builtin_interfaces": ["Time"],
@@ -137,6 +142,13 @@ class Ros:
         }
         members["rclpy"] = dict.fromkeys(("init", "try_shutdown"), lambda: None)
         members["rclpy"]["spin"] = lambda node, executor=None: self.spun.append(node)
+        members["rclpy.duration"] = {"Duration": dict}
+        members["rclpy.time"] = {"Time": SimpleNamespace(from_msg=lambda stamp: stamp)}
+        members["tf2_ros"] = {
+            "Buffer": lambda: SimpleNamespace(lookup_transform=self._look_up),
+            "TransformException": KeyError,
+            "TransformListener": lambda buffer, node: None,
+        }
         members["rclpy.callback_groups"] = {"MutuallyExclusiveCallbackGroup": object}
         members["rclpy.node"] = {"Node": self.node_type()}
         shutdown = type("ExternalShutdownException", (Exception,), {})

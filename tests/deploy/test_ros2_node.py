@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 from scene_client import InvalidRequestError, UnreachableError
+from scene_client.frames import Conventions
 from scene_client.schemas import MissingAnswer
 from tests.client.homes import COMMON, FakeClient
 from tests.client.peers import Peer, answering
@@ -221,6 +222,57 @@ def test_positions_are_in_the_frame_of_the_map(run: Run, rooms: str) -> None:
     assert by_label["lamp"]["position"] == pytest.approx([3.0, 3.0, 0.0])
     other = {one["label"]: one for one in seen(detection("cup", 300.0), frame="odom")}
     assert "position" not in other["cup"]
+
+
+def test_tf2_has_the_poses_of_robot_and_camera(run: Run, rooms: str) -> None:
+    """A camera 1 m above the floor, 0.2 m ahead of a robot that looks along y, 30 degrees down."""
+    running = run(rooms=rooms)
+    pretend(running)
+    half, turn = math.sqrt(0.5), importlib.import_module("scene_reasoning.detections").product
+    yaw, pitch = (0.0, 0.0, half, half), (0.0, math.sin(math.pi / 12), 0.0, math.cos(math.pi / 12))
+    camera = turn(turn(yaw, pitch), (-0.5, 0.5, -0.5, 0.5))
+    for frame, place, q in (("base_link", (2, 1, 0), yaw), ("camera_optical", (2, 1.2, 1), camera)):
+        transform = blank(STORE, "geometry_msgs/msg/Transform")
+        for vector, names, values in (
+            (transform.translation, "xyz", place),
+            (transform.rotation, "xyzw", q),
+        ):
+            for name, value in zip(names, values, strict=True):
+                setattr(vector, name, float(value))
+        running.ros.transforms[frame] = transform
+    cup = detection("cup", 0.0)
+    cup.bbox.center.position.z = 1.0  # metres ahead of the camera, in its middle
+    # The box stands upright in the map: its axes in the frame of the camera.
+    x, y, z, w = camera
+    o = turn((-x, -y, -z, w), (0.0, 0.0, 0.0, 1.0))
+    for name, value in zip("xyzw", o, strict=True):
+        setattr(cup.bbox.center.orientation, name, value)
+    running.see(array(cup, frame="camera_optical"), 1, 2, 3)
+    scene = running.node.home.ask(lambda home: home.scene()).result()
+    assert scene["viewpoint"] == pytest.approx({"x": 2.0, "y": 1.0, "yaw": math.pi / 2})
+    (placed,) = scene["objects"]
+    ahead = math.cos(math.pi / 6)
+    assert placed["position"] == pytest.approx([2.0, 1.2 + ahead, 0.5], abs=1e-3)
+    assert placed["size"] == [0.4, 0.6, 0.8]
+    assert placed["yaw"] == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("up", ["z", "y", "-y"])
+def test_a_transform_is_that_of_the_conventions(monkeypatch: pytest.MonkeyPatch, up: Any) -> None:
+    """Rotations to body axes, as `scene_client` knows them."""
+    load_package(monkeypatch)
+    package = importlib.import_module("scene_reasoning.detections")
+    frame = {"z": "base_link", "y": "base_link", "-y": "camera_optical"}[up]
+    message = array(detection("cup", 1.0, 2.0), frame=frame)
+    box = message.detections[0].bbox
+    box.center.position.z = 3.0
+    converter = package.Converter(conventions={"up": "y"} if up == "y" else {})
+    transform = package.Transform.of((0.0, 0.0, 0.0), "map", frame)
+    (moved,) = converter.detections(message, transform)
+    q = box.center.orientation
+    position, size, _ = Conventions(up).box((1.0, 2.0, 3.0), (0.4, 0.6, 0.8), (q.x, q.y, q.z, q.w))
+    assert moved["position"] == pytest.approx(position)
+    assert moved["size"] == size
 
 
 def test_a_room_is_named_by_a_topic(run: Run) -> None:

@@ -5,13 +5,48 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from scene_client.frames import Conventions, is_optical, is_world_fixed
 from scene_client.ros_fields import LabelMap, read_label_map
 from scene_client.vision_msgs import from_message
 
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]  # x, y, z, w
 Pose = tuple[float, float, float]  # x and y in metres, yaw in radians
+
+# Rotations to body axes, from an optical frame and from a frame whose y axis points up.
+_OPTICAL: Quaternion = (-0.5, 0.5, -0.5, 0.5)
+_Y_UP: Quaternion = (0.5, -0.5, -0.5, 0.5)
+
+
+class Transform(NamedTuple):
+    """A transform to the map: a rotation, then a translation in metres."""
+
+    rotation: Quaternion = (0.0, 0.0, 0.0, 1.0)
+    translation: Vector = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def of(cls, pose: Pose | None, pose_frame: str, frame: str) -> Transform | None:
+        """Return the transform of a frame of the robot, or of the map, if the pose is known.
+
+        Every frame of the robot counts as its base, because the pose has no offset of a camera. The
+        result is None for another frame of the world than that of the pose.
+        """
+        if pose is None or (is_world_fixed(frame) and pose_frame not in ("", frame)):
+            return None
+        if is_world_fixed(frame) or frame == pose_frame:
+            return cls()
+        x, y, yaw = pose
+        turn = (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
+        return cls(product(turn, _OPTICAL) if is_optical(frame) else turn, (x, y, 0.0))
+
+    @property
+    def pose(self) -> Pose:
+        """The pose of the origin of the frame."""
+        x, y, z, w = self.rotation
+        yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        return self.translation[0], self.translation[1], yaw
 
 
 @dataclass
@@ -36,45 +71,48 @@ class Converter:
     def __post_init__(self) -> None:
         read_label_map(self.label_map)
 
-    def detections(
-        self, message: Any, pose: Pose | None = None, pose_frame: str = ""
-    ) -> list[dict[str, Any]]:
-        """Return the detections of a message, with positions if the pose of the robot is known.
-
-        Positions in `pose_frame`, or without its name in any frame of the world, are kept. Those in
-        a frame of the robot are moved by its pose; the offset of the camera on the robot is
-        neglected. Positions in another frame of the world are left out.
+    def detections(self, message: Any, transform: Transform | None) -> list[dict[str, Any]]:
+        """Return the detections of a message, with positions if there is a transform.
 
         Raises:
             MessageError: the message cannot be converted.
         """
         fields = from_message(message, self.label_map, min_score=self.min_score, boxes=self.boxes)
-        frame = fields.get("frame_id", "")
-        is_fixed = is_world_fixed(frame) or (frame != "" and frame == pose_frame)
-        if pose is None or (is_fixed and pose_frame not in ("", frame)):
-            unknown = {"position", "size", "orientation"}
-            return [
-                {name: value for name, value in one.items() if name not in unknown}
-                for one in fields["objects"]
-            ]
-        conventions = Conventions(**self.conventions)
-        if is_optical(frame):
-            conventions = conventions._replace(up="-y")
-        origin = (0.0, 0.0, 0.0) if is_fixed else pose
-        return [_moved(one, conventions, origin) for one in fields["objects"]]
+        return [self._moved(one, transform) for one in fields["objects"]]
+
+    def _moved(self, thing: dict[str, Any], transform: Transform | None) -> dict[str, Any]:
+        """Return a detection with an upright box in the map."""
+        position, size, orientation = (
+            tuple(vector.values()) if (vector := thing.pop(name, None)) else None
+            for name in ("position", "size", "orientation")
+        )
+        if position is None or transform is None:
+            return thing
+        conventions, rotation = Conventions(**self.conventions), transform.rotation
+        if conventions.up == "y":
+            rotation = product(rotation, _Y_UP)
+        if orientation is not None and conventions.quaternion_order == "wxyz":
+            orientation = (*orientation[1:], orientation[0])
+        place, size, yaw = conventions._replace(up="z", quaternion_order="xyzw").box(
+            rotated(position, rotation), size, product(rotation, orientation or (0, 0, 0, 1))
+        )
+        thing["position"] = tuple(a + b for a, b in zip(place, transform.translation, strict=True))
+        return thing | ({"yaw": yaw} if size is None else {"yaw": yaw, "size": size})
 
 
-def _moved(thing: dict[str, Any], conventions: Conventions, origin: Pose) -> dict[str, Any]:
-    """Return a detection with an upright box, moved from a frame whose origin is at a pose."""
-    position, size, orientation = (thing.pop(n, None) for n in ("position", "size", "orientation"))
-    if position is None:
-        return thing
-    (x, y, z), size, yaw = conventions.box(
-        tuple(position.values()),
-        None if size is None else tuple(size.values()),
-        None if orientation is None else tuple(orientation.values()),
+def product(a: Quaternion, b: Quaternion) -> Quaternion:
+    """Return the rotation `b`, then `a`."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return (
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
     )
-    sin, cos = math.sin(origin[2]), math.cos(origin[2])
-    place = (origin[0] + cos * x - sin * y, origin[1] + sin * x + cos * y, z)
-    thing |= {"position": place, "yaw": math.remainder(yaw + origin[2], math.tau)}
-    return thing if size is None else thing | {"size": size}
+
+
+def rotated(vector: Vector, turn: Quaternion) -> Vector:
+    """Return a rotated vector."""
+    x, y, z, w = turn
+    return product(product(turn, (*vector, 0.0)), (-x, -y, -z, w))[:3]

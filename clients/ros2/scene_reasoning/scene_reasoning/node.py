@@ -1,8 +1,8 @@
 """ROS 2 node that holds a `scene_client.Home`: what a moving robot knows about the rooms of a home.
 
 Subscriptions: ``detections`` (vision_msgs/Detection3DArray or Detection2DArray), ``label_info``
-(vision_msgs/LabelInfo), ``pose`` (geometry_msgs/PoseWithCovarianceStamped) and ``room``
-(std_msgs/String).
+(vision_msgs/LabelInfo), ``pose`` (geometry_msgs/PoseWithCovarianceStamped; without it, tf2 has the
+pose) and ``room`` (std_msgs/String).
 Publications: ``~/events`` and ``~/things`` (scene_reasoning_msgs), ``~/missing`` (std_msgs/String,
 JSON), ``~/ghosts`` (visualization_msgs/MarkerArray) and ``/diagnostics``.
 Services: ``~/where_is`` and ``~/confirm`` (scene_reasoning_msgs).
@@ -22,20 +22,23 @@ import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rclpy.time import Time
 from scene_reasoning_msgs.msg import RoomProbability, SceneEvent, ThingArray
 from scene_reasoning_msgs.srv import Confirm, WhereIs
 from std_msgs.msg import Header, String
+from tf2_ros import Buffer, TransformException, TransformListener
 from vision_msgs.msg import Detection2DArray, Detection3DArray, LabelInfo
 from visualization_msgs.msg import MarkerArray
 
 from scene_client import Client, ClientError, Event, Home, Settings
 from scene_client.frames import CONVENTIONS
-from scene_client.ros_fields import MessageError
+from scene_client.ros_fields import MessageError, frame_of
 from scene_reasoning import messages
-from scene_reasoning.detections import Converter, Pose
+from scene_reasoning.detections import Converter, Pose, Transform
 from scene_reasoning.home_thread import HomeThread
 
 KINDS = {"3d": Detection3DArray, "2d": Detection2DArray}
@@ -60,7 +63,7 @@ class Counted:
 
 
 class SceneNode(Node):
-    """Update a home with each message of detections, and publish what has changed."""
+    """Update a home with each message of detections, and publish its changes."""
 
     def __init__(self) -> None:
         super().__init__("scene")
@@ -92,14 +95,17 @@ class SceneNode(Node):
             self._parameter("boxes", True),
             {name: value for name in CONVENTIONS if (value := self._parameter(name, ""))},
         )
-        # The default NaN means that the pose is unknown until the first message.
+        # The default NaN means that tf2 has the pose, until the first message with a pose.
         viewpoint = tuple(self._parameter("viewpoint", [math.nan] * 3))
         self.pose: Pose | None = viewpoint if all(map(math.isfinite, viewpoint)) else None
-        self.pose_frame = ""
+        self.pose_frame, self.map_frame = "", self._parameter("map_frame", "map")
+        self.base_frame = self._parameter("base_frame", "base_link")
+        self.transforms = Buffer()
+        self.listener = TransformListener(self.transforms, self)
         self.room: str | None = None
         self.missing_period = self._parameter("missing_period", 5.0)
         self.ghosts_shown = self._parameter("ghosts", 3)
-        self.header = Header(frame_id="map")  # of the last frame
+        self.header = Header(frame_id=self.map_frame)  # of the last frame
         self.next: dict[str, float] = {}  # times of the next publications, by topic
         # What the thread of the home reports to the diagnostics.
         self.frames, self.error, self.lost = 0, "", ""
@@ -143,10 +149,7 @@ class SceneNode(Node):
         self.converter.label_map = message
 
     def on_pose(self, message: Any) -> None:
-        position, q = message.pose.pose.position, message.pose.pose.orientation
-        # Yaw of the unit quaternion q, in radians.
-        yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
-        self.pose = (position.x, position.y, yaw)
+        self.pose = _transform(message.pose.pose.position, message.pose.pose.orientation).pose
         self.pose_frame = message.header.frame_id
 
     def on_room(self, message: Any) -> None:
@@ -186,9 +189,15 @@ class SceneNode(Node):
     def _update(
         self, home: Home, message: Any, stamp: Any, pose: Any, pose_frame: str, room: str | None
     ) -> None:
-        self.header = Header(stamp=stamp, frame_id=pose_frame or "map")
+        self.header = Header(stamp=stamp, frame_id=pose_frame or self.map_frame)
+        frame = frame_of(message.header)
+        if pose is not None:
+            transform = Transform.of(pose, pose_frame, frame)
+        elif transform := self._look_up(frame, stamp):
+            base = self._look_up(self.base_frame, stamp)
+            pose = None if base is None else base.pose
         try:
-            detections = self.converter.detections(message, pose, pose_frame)
+            detections = self.converter.detections(message, transform)
             events = home.update(detections, pose, stamp, room=room)
             self._publish(home, events)
             self._publish_missing(home)
@@ -197,6 +206,15 @@ class SceneNode(Node):
             # Any other error is a defect of the node, and ends the node.
             self.error = f"{type(error).__name__}: {error}"
         self.frames += 1
+
+    def _look_up(self, frame: str, stamp: Any) -> Transform | None:
+        """Return the transform from a frame to the map, or None if tf2 does not have it soon."""
+        at, patience = Time.from_msg(stamp), Duration(seconds=0.2)
+        try:
+            found = self.transforms.lookup_transform(self.map_frame, frame, at, patience).transform
+        except TransformException:
+            return None
+        return _transform(found.translation, found.rotation)
 
     def _publish(self, home: Home, events: list[Event]) -> None:
         for event in events:
@@ -261,6 +279,10 @@ class SceneNode(Node):
         self.home.close()
         self.client.close()
         super().destroy_node()
+
+
+def _transform(position: Any, q: Any) -> Transform:
+    return Transform((q.x, q.y, q.z, q.w), (position.x, position.y, position.z))
 
 
 def main() -> None:
