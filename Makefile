@@ -92,7 +92,7 @@ docs: $(EVERYTHING)  ## build the documentation as a site that works without int
 audit: $(EVERYTHING)  ## report known vulnerabilities and risky code, write bills of materials (build/)
 	$(BIN)/python scripts/audit.py $(ARGS)
 
-image: $(BIN)/python  ## build the image, ask its service the five questions, remove it (Docker or buildah)
+image: $(BIN)/python  ## build the image, ask its service its questions, remove it (Docker or buildah)
 	$(BIN)/python deploy/image.py $(ARGS)
 
 training: $(TRAINING)  ## install the service and training: adapt a home, train on your own scenes

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Build the image from the Dockerfile, start it, and ask it the five questions.
+"""Build the image from the Dockerfile, start it, and ask it its questions.
 
     python3 deploy/image.py                      Docker if it runs here, else buildah
     python3 deploy/image.py --engine buildah     needs root, buildah and debootstrap, but no daemon
@@ -404,7 +404,7 @@ def check(engine: Docker | Buildah) -> None:
     if (users := engine.users()) != {USER}:
         raise ImageError(f"the service runs as user {users}, not {USER}")
     engine.stop()
-    print(f"five questions answered by user {USER}; nothing written outside /tmp")
+    print(f"all questions answered by user {USER}; nothing written outside /tmp")
 
 
 def main() -> int:

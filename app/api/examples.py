@@ -48,6 +48,17 @@ def _batch(result: dict[str, Any]) -> dict[str, Any]:
 REQUESTS: Final[dict[str, dict[str, Example]]] = {
     **{question.name: dict(question.examples) for question in QUESTIONS},
     **{f"{question.name}_batch": BATCH for question in QUESTIONS if not question.samples},
+    "confirm": {
+        "bedroom": Example(
+            "a bedroom in which everything is right",
+            {"objects": ["bed", "lamp", "chair"], "room_type": "bedroom"},
+        ),
+        "unknown-labels": Example(
+            "a label that the model does not know",
+            {"objects": ["bed", "nigthstand"]},
+            "unknown-labels",
+        ),
+    },
     "scenes": {
         "table": Example(
             "a table of detections",
@@ -72,6 +83,7 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
         for question in QUESTIONS
         if not question.samples
     },
+    "confirm": {"request_id": REQUEST_ID, "scene_id": "2026-01-02T03-9f2c1e0a4b7d6c58"},
     "scenes": {
         "request_id": REQUEST_ID,
         "scenes": [{"name": "42", "scene": {"objects": [{"id": "desk_1", "label": "desk"}]}}],

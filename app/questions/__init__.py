@@ -1,4 +1,4 @@
-"""Five questions about a scene and one about a home. A module contains everything about one.
+"""The questions about a scene and about a home. The module of a question has all about it.
 
     relations   Which spatial relations hold between the objects of the scene?
     missing     Which unlisted objects are probably in the scene, and where? `more` adds the listed

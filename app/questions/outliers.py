@@ -274,12 +274,12 @@ _EXAMPLE_ANSWER: Final = {
     "outliers": [
         {
             "object": "wc_1", "label": "toilet", "listed_as": "WC", "probability": 0.94,
-            "log_odds": 2.75, "is_outlier": True,
+            "log_odds": 2.75, "real": 0.9, "is_outlier": True, "reason": "does-not-belong",
             "because": [{"object": "bed", "log_odds_change": 1.8}],
             "usually_with": ["toilet paper", "sink", "faucet"],
         },
         {
-            "object": "bed", "label": "bed", "probability": 0.03, "log_odds": -3.48,
+            "object": "bed", "label": "bed", "probability": 0.03, "log_odds": -3.48, "real": 0.98,
             "is_outlier": False,
             "because": [{"object": "lamp_1", "log_odds_change": -0.6}],
             "usually_with": [],

@@ -115,6 +115,7 @@ def where(
             {
                 "room": rooms[spot.room].name,
                 "probability": rounded_number(spot.weight / total),
+                "is_listed": False,
                 **spot.fields,
             }
             for spot in places[:top_k]
@@ -329,11 +330,18 @@ _EXAMPLE_ANSWER: Final = {
         {
             "room": "bedroom",
             "probability": 0.42,
+            "is_listed": False,
             "relation": "on-top",
             "object": "nightstand_1",
         },
-        {"room": "office", "probability": 0.18, "relation": "on-top", "object": "desk"},
-        {"room": "bedroom", "probability": 0.14},
+        {
+            "room": "office",
+            "probability": 0.18,
+            "is_listed": False,
+            "relation": "on-top",
+            "object": "desk",
+        },
+        {"room": "bedroom", "probability": 0.14, "is_listed": False},
     ],
     "rooms": [
         {"room": "bedroom", "probability": 0.58},

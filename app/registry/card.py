@@ -18,9 +18,10 @@ _RESEARCH_WARNING = """\
 
 _INTENDED_USE = """\
 A robot recognises the objects of a scene and asks the model about them. The scene should resemble
-the scenes of the data sources below. The model answers five questions: Which spatial relations hold
-between the objects? Which object is missing, and where would it be? Which object does not belong?
-Which room is it? What does a similar scene look like?"""
+the scenes of the data sources below. The model answers questions about a scene: Which spatial
+relations hold between the objects? Which object is missing, and where would it be? Which object
+does not belong? Which room is it? What does a similar scene look like? Where in a home is a
+thing?"""
 
 _MEASURED = """\
 The figures come from test scenes of each source. Training and calibration did not use these scenes.

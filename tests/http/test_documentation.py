@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import AsyncIterator
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from scene_client.schemas import Problem
 from tests.http.test_problems import problem
 from tests.services import LiveService, defect, serve
 
+API_KEY = "incorrect-zebra-capacitor-nail"
 PAGES = ["/", "/docs", "/redoc", "/problems", "/problems/not-json"]
 # Digest of app/static/vendor, so that a change of a library's file is seen.
 LIBRARIES = "a4252c50f31707e177320a71048b678dc5a20d9d0909694ee37cf104f267486e"
@@ -75,6 +77,17 @@ def test_libraries_are_unchanged(repository: Path) -> None:
     assert sha256(text.encode()).hexdigest() == LIBRARIES
 
 
+@pytest.fixture(scope="module")
+async def client(
+    shared_store: Path, tmp_path_factory: pytest.TempPathFactory, anyio_backend: str
+) -> AsyncIterator[AsyncClient]:
+    """A client of a service with all routes."""
+    recording = tmp_path_factory.mktemp("recording") / "scenes.jsonl"
+    async with serve(shared_store, api_key=API_KEY, recording=recording) as client:
+        client.headers["X-API-Key"] = API_KEY
+        yield client
+
+
 @pytest.fixture
 async def document(client: AsyncClient) -> Any:
     return (await client.get("/openapi.json")).json()
@@ -103,8 +116,8 @@ async def test_errors_are_problems(document: dict[str, Any]) -> None:
                 described = Problem.model_validate(example["value"], extra="forbid")
                 assert str(described.status) == status
                 documented.add(slug)
-    # A route lists each error, unless only Starlette or a check of the origin or the key raises it.
-    assert documented == {slug for slug, kind in ERRORS.items() if {*kind.steps} - {"http", "key"}}
+    # A route lists each error, unless only Starlette or a check of the origin raises it.
+    assert documented == {slug for slug, kind in ERRORS.items() if {*kind.steps} - {"http"}}
 
 
 def model_of(content: dict[str, Any]) -> Any:

@@ -1,4 +1,4 @@
-"""The five questions, answered by real artifacts of every variant."""
+"""The questions, answered by real artifacts of every variant."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Schemas of the answers to the five questions, and of problems."""
+"""Schemas of the parts that all answers share, and of problems."""
 
 from __future__ import annotations
 

@@ -96,12 +96,12 @@ class Spot(Reply):
     room: str
     """id of the room"""
     probability: Probability
+    is_listed: bool = False
+    """true if the request lists the thing itself"""
     relation: RelationName | None = None
     """relation of the thing to `object`"""
     object: str | None = None
     """id of an object of the room; for a listed thing, that of the thing itself"""
-    is_listed: bool = False
-    """true if the request lists the thing itself"""
     offset: Offset | None = None
     """offset from `object` in metres, as in the placements of `/missing`"""
 
