@@ -348,6 +348,14 @@ def test_class_ids_need_a_label_map(run: Run) -> None:
     assert running.status().level == 0
 
 
+def test_the_program_spins_the_node_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    ros = Ros({})
+    load_package(monkeypatch, ros)
+    importlib.import_module("scene_reasoning.node").main()
+    assert len(ros.spun) == 1
+    assert ros.destroyed
+
+
 def test_an_unexpected_error_ends_the_node(run: Run) -> None:
     running = run()
     pretend(running).rooms = lambda *_, **__: 1 / 0  # type: ignore[method-assign,assignment]
