@@ -1,8 +1,8 @@
-"""A ROS 2 node that publishes which detections do not belong to the room.
+"""A ROS 2 node that publishes which things do not belong to the room.
 
     python3 examples/ros2_node.py --ros-args -r detections:=/my_detector/detections
 
-clients/ros2/scene_reasoning is the complete node, with parameters, markers and diagnostics.
+The robot stands still; clients/ros2/scene_reasoning is the complete node, for a moving robot.
 """
 
 from __future__ import annotations
@@ -17,38 +17,39 @@ from rclpy.qos import qos_profile_sensor_data
 from std_msgs.msg import String
 from vision_msgs.msg import Detection3DArray
 
-from scene_client import Client, ClientError
+from scene_client import Client, ClientError, Home
 from scene_client.ros_fields import MessageError
 from scene_client.vision_msgs import from_detection3d_array
 
 
 class Watcher(Node):
-    """Ask about detections in a thread, so that no callback waits for the service."""
+    """Update a home in a thread, so that no callback waits for the service."""
 
     def __init__(self) -> None:
         super().__init__("watcher")
-        self.scene = Client(os.environ.get("SCENE_URL", "http://127.0.0.1:8000"), timeout=0.5)
+        self.scene = Client(os.environ.get("SCENE_URL", "http://127.0.0.1:8000"), timeout=1.0)
+        self.home = Home(self.scene)
         self.thread = ThreadPoolExecutor(max_workers=1)
-        self.asked = self.thread.submit(lambda: None)
-        self.outliers = self.create_publisher(String, "~/outliers", 1)
+        self.updated = self.thread.submit(lambda: None)
+        self.events = self.create_publisher(String, "~/events", 10)
         self.create_subscription(
             Detection3DArray, "detections", self.on_detections, qos_profile_sensor_data
         )
 
     def on_detections(self, message: Detection3DArray) -> None:
-        """Ask, unless the service still answers about an earlier message."""
-        if self.asked.done():
-            self.asked = self.thread.submit(self.ask, message)
+        """Update the home, unless it is still busy with an earlier message."""
+        if self.updated.done():
+            self.updated = self.thread.submit(self.update, message)
 
-    def ask(self, message: Detection3DArray) -> None:
-        """Publish the ids of the outliers, separated by commas."""
+    def update(self, message: Detection3DArray) -> None:
+        """Publish each change as kind and label, such as `out-of-place toilet`."""
         try:
-            answer = self.scene.outliers(**from_detection3d_array(message), detail="scores")
+            frame = from_detection3d_array(message)
+            events = self.home.update(frame["objects"], (0.0, 0.0, 0.0), message.header.stamp)
+            for event in events:
+                self.events.publish(String(data=f"{event.kind} {event.label}"))
         except (ClientError, MessageError) as error:
             self.get_logger().warning(f"{type(error).__name__}: {error}")
-            return
-        names = [thing.object for thing in answer.outliers if thing.is_outlier]
-        self.outliers.publish(String(data=",".join(names)))
 
 
 if __name__ == "__main__":

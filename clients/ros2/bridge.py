@@ -1,4 +1,8 @@
-"""Options, questions and error reports of the programs that bridge to a robot without rclpy."""
+"""The common part of the programs that answer single messages of a robot, without rclpy.
+
+They ask about each message alone, so they fit a camera at a fixed place, and trials. For a moving
+robot, the node of this folder and `scene_client.Home` remember what the robot has seen.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +12,14 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 from scene_client import Client, ClientError, InvalidRequestError
-from scene_client.ros_fields import MessageError
+from scene_client.ros_fields import MessageError, read_label_map
+from scene_client.vision_msgs import from_message
 
-# The ROS package beside this file; a colcon workspace installs it.
-sys.path.insert(0, str(Path(__file__).resolve().parent / "scene_reasoning"))
-
-from scene_reasoning.advisor import QUESTIONS, Advisor
+QUESTIONS = ("missing", "outliers", "relations", "rooms")
 
 
 def options(description: str) -> argparse.ArgumentParser:
@@ -33,6 +35,36 @@ def options(description: str) -> argparse.ArgumentParser:
     return arguments
 
 
+@dataclass
+class Advisor:
+    """The questions about each message."""
+
+    client: Client
+    questions: list[str]
+    label_map: str | None
+
+    def answer(self, message: Any) -> str | None:
+        """Return the answers about a message as JSON. Report an error, and return None."""
+        try:
+            fields = from_message(message, self.label_map)
+            answers = self._ask(fields) if fields["objects"] else {}
+        except (ClientError, MessageError) as error:
+            complain(f"{type(error).__name__}: {error}")
+            return None
+        header = {name: fields.get(name) for name in ("frame_id", "stamp")}
+        notes = [note._asdict() for note in fields.notes]
+        return json.dumps({**header, **answers, "notes": notes})
+
+    def _ask(self, fields: dict[str, Any]) -> dict[str, Any]:
+        copied = {"frame_id", "stamp"}
+        return {
+            question: getattr(self.client, question)(**fields).model_dump(
+                mode="json", exclude=copied, exclude_none=True
+            )
+            for question in self.questions
+        }
+
+
 @contextmanager
 def advisor(arguments: argparse.ArgumentParser, given: argparse.Namespace) -> Iterator[Advisor]:
     """Open a connection to the service, with the API key in SCENE_API_KEY.
@@ -42,20 +74,11 @@ def advisor(arguments: argparse.ArgumentParser, given: argparse.Namespace) -> It
     try:
         key = os.environ.get("SCENE_API_KEY")
         client = Client(given.service, timeout=given.timeout, api_key=key or None)
-        found = Advisor(client, given.questions, given.label_map)
+        read_label_map(given.label_map)
     except (InvalidRequestError, MessageError) as error:
         arguments.error(str(error))
     with client:
-        yield found
-
-
-def answer(advisor: Advisor, message: Any) -> str | None:
-    """Return the answers about a message as JSON. Report an error, and return None."""
-    try:
-        return json.dumps(advisor.advise(message).to_json())
-    except (ClientError, MessageError) as error:
-        complain(f"{type(error).__name__}: {error}")
-        return None
+        yield Advisor(client, given.questions, given.label_map)
 
 
 def complain(words: str) -> None:

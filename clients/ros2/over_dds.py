@@ -4,8 +4,9 @@
     python clients/ros2/over_dds.py /detections_3d --questions missing outliers
 
 The program subscribes to a vision_msgs/Detection3DArray and publishes each answer as JSON in a
-std_msgs/String, like the ROS 2 node of this folder. While a question is in progress, only the
-newest message is kept. Errors go to standard error. CYCLONEDDS_URI selects the network interface.
+std_msgs/String. It asks about each message alone, as `bridge` describes. While a question is in
+progress, only the newest message is kept. Errors go to standard error. CYCLONEDDS_URI selects the
+network interface.
 """
 
 from __future__ import annotations
@@ -109,7 +110,7 @@ def main() -> None:
         )
         with bridge.advisor(arguments, given) as advisor:
             for message in detections(participant, given.detections):
-                if (answer := bridge.answer(advisor, message)) is not None:
+                if (answer := advisor.answer(message)) is not None:
                     writer.write(String(answer))
     except DDSException as error:
         bridge.complain(f"DDS: {error}")

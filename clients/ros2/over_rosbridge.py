@@ -3,10 +3,10 @@
 
     python clients/ros2/over_rosbridge.py ws://robot:9090 /detections_3d --questions missing
 
-The program prints each answer as one line of JSON. While a question is in progress, only the newest
-message is kept. Errors, and the bridge's own errors and warnings, go to standard error. The exit
-status is 1 if the bridge cannot be reached or closes the connection, so that a supervisor can
-restart the program.
+The program prints each answer as one line of JSON. It asks about each message alone, as `bridge`
+describes. While a question is in progress, only the newest message is kept. Errors, and the
+bridge's own errors and warnings, go to standard error. The exit status is 1 if the bridge cannot be
+reached or closes the connection, so that a supervisor can restart the program.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import sys
 from collections.abc import Iterator
 from typing import Any, NoReturn
 
-from bridge import Advisor, advisor, answer, complain, options
+from bridge import Advisor, advisor, complain, options
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
@@ -72,7 +72,7 @@ def answer_each(bridge: str, topic: str, asked: Advisor) -> NoReturn:
     with socket:
         try:
             for message in messages(socket, topic):
-                if (found := answer(asked, message)) is not None:
+                if (found := asked.answer(message)) is not None:
                     print(found, flush=True)
         except ConnectionClosed as error:
             complain(f"the bridge at {bridge} is gone: {error}")

@@ -16,6 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 MESSAGES = Path(__file__).parent / "msg"
+OWN = Path(__file__).resolve().parents[2] / "clients" / "ros2" / "scene_reasoning_msgs"
 
 
 def _store(layout: str) -> Typestore:
@@ -24,6 +25,12 @@ def _store(layout: str) -> Typestore:
     for folder in (MESSAGES / "common", MESSAGES / layout):
         for path in folder.glob("*.msg"):
             types |= get_types_from_msg(path.read_text("utf-8"), f"vision_msgs/msg/{path.stem}")
+    for path in OWN.glob("msg/*.msg"):
+        types |= get_types_from_msg(path.read_text("utf-8"), f"{OWN.name}/msg/{path.stem}")
+    for path in OWN.glob("srv/*.srv"):
+        parts = zip(("Request", "Response"), path.read_text("utf-8").split("---\n"), strict=True)
+        for part, text in parts:
+            types |= get_types_from_msg(text, f"{OWN.name}/msg/{path.stem}_{part}")
     store.register(types)
     return store
 

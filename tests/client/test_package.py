@@ -29,6 +29,7 @@ def test_the_blocking_client_is_up_to_date():
         ("clients/python/scene_client/__init__.py", r'__version__ = "(.+)"'),
         ("clients/ros2/scene_reasoning/package.xml", r"<version>(.+)</version>"),
         ("clients/ros2/scene_reasoning/setup.py", r'version="(.+)"'),
+        ("clients/ros2/scene_reasoning_msgs/package.xml", r"<version>(.+)</version>"),
         ("Dockerfile", r"org\.opencontainers\.image\.version=(\S+)"),
         ("docs/operations.md", r"--branch v(\S+)"),
         ("docs/upgrading.md", rf"^\| (\S+) \| {FORMAT} \| \1; "),
@@ -107,20 +108,20 @@ package = Path("clients/ros2/scene_reasoning/scene_reasoning")
 for module in package.glob("*.py"):
     compile(module.read_text("utf-8"), str(module), "exec")
 sys.path.insert(0, str(package.parent))
-from scene_reasoning.advisor import Advisor
-from scene_reasoning.ghosts import ghosts
-from scene_reasoning.latest import Latest
+from scene_client import Home
+from scene_reasoning.detections import Converter, Transform
+from scene_reasoning.home_thread import HomeThread
 
 message = json.loads(Path("clients/ros2/detections.json").read_text("utf-8"))
 with Client(sys.argv[1], timeout=30) as client:
     assert client.missing(["bed"]).missing == asyncio.run(ask()).missing
-    latest = Latest(Advisor(client).advise)
-    latest.see(message)
-    while (outcome := latest.tick()) is None:
-        pass
-    latest.close()
-advice = outcome.future.result()
-print(json.dumps([sorted(advice.answers), len(ghosts(advice, 3))]))
+    thread, pose = HomeThread(Home(client)), (0.0, 0.0, 0.0)
+    detections = Converter().detections(message, Transform())
+    for second in range(4):
+        thread.ask(lambda home: home.update(detections, pose, second)).result()
+    things = thread.ask(Home.things).result()
+    thread.close()
+print(json.dumps(len(things)))
 """
 
 
@@ -142,7 +143,7 @@ def test_python_310(source: Path, tmp_path: Path, live: LiveService) -> None:
     assert json.loads(done.stdout)["missing"]
     plain = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     done = run_program(python, "-W", "error", "-c", ON_A_ROBOT, live.url, env=plain)
-    assert json.loads(done.stdout) == [["missing", "outliers"], 3]
+    assert json.loads(done.stdout) == 8
 
 
 GENERATED = """

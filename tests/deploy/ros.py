@@ -4,7 +4,6 @@ A publisher writes each message in CDR and reads it back: a message must fit its
 """
 
 import sys
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,8 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.client.ros_messages import Layout, blank, through_cdr
-from tests.services import PATIENCE
+from tests.client.ros_messages import OWN, Layout, blank, through_cdr
 
 STORE = Layout.current
 PACKAGE = Path(__file__).resolve().parents[2] / "clients" / "ros2" / "scene_reasoning"
@@ -32,6 +30,12 @@ def message_type(name: str) -> Any:
         return blank(STORE, name, **values)
 
     return type(name.rpartition("/")[2], (), {**constants, "__new__": new, "ros_name": name})
+
+
+def service_type(name: str) -> Any:
+    """A service as rclpy has it: a class with the classes of its request and its response."""
+    parts = {part: message_type(f"{name}_{part}") for part in ("Request", "Response")}
+    return type(name.rpartition("/")[2], (), parts)
 
 
 @dataclass
@@ -57,9 +61,11 @@ class Ros:
     declared: dict[str, Any] = field(default_factory=dict)
     subscriptions: dict[str, tuple[Any, Callable[[Any], None]]] = field(default_factory=dict)
     publishers: dict[str, Publisher] = field(default_factory=dict)
+    services: dict[str, tuple[Any, Callable[[Any, Any], Any]]] = field(default_factory=dict)
     timers: list[tuple[float, Callable[[], None]]] = field(default_factory=list)
     spun: list[Any] = field(default_factory=list)
     warned: list[str] = field(default_factory=list)
+    transforms: dict[str, Any] = field(default_factory=dict)  # from these frames to the map
     destroyed: bool = False
 
     def node_type(self) -> type:
@@ -80,6 +86,11 @@ class Ros:
             def create_publisher(self, kind: Any, topic: str, qos: Any) -> Publisher:
                 return ros.publishers.setdefault(topic, Publisher(kind))
 
+            def create_service(
+                self, kind: Any, name: str, callback: Any, callback_group: Any
+            ) -> None:
+                ros.services[name] = kind, callback
+
             def create_timer(self, period: float, callback: Callable[[], None]) -> None:
                 ros.timers.append((period, callback))
 
@@ -95,10 +106,28 @@ class Ros:
 
         return Node
 
+    def _look_up(self, target: str, source: str, at: Any, timeout: Any) -> Any:
+        assert target == "map"
+        return SimpleNamespace(transform=self.transforms[source])
+
     def modules(self) -> dict[str, Any]:
         names = {
-            "std_msgs": ["String"],
-            "geometry_msgs": ["PoseWithCovarianceStamped"],
+            "builtin_interfaces": ["Time"],
+            "std_msgs": ["Header", "String"],
+            "geometry_msgs": [
+                "Point",
+                "Pose",
+                "PoseWithCovarianceStamped",
+                "Quaternion",
+                "Vector3",
+            ],
+            "scene_reasoning_msgs": [
+                "Place",
+                "RoomProbability",
+                "SceneEvent",
+                "Thing",
+                "ThingArray",
+            ],
             "vision_msgs": ["Detection3DArray", "Detection2DArray", "LabelInfo"],
             "visualization_msgs": ["Marker", "MarkerArray"],
             "diagnostic_msgs": ["DiagnosticArray", "DiagnosticStatus", "KeyValue"],
@@ -108,34 +137,31 @@ class Ros:
             for package, types in names.items()
         }
         members |= {package: {} for package in names}
+        members["scene_reasoning_msgs.srv"] = {
+            name: service_type(f"{OWN.name}/msg/{name}") for name in ("Confirm", "WhereIs")
+        }
         members["rclpy"] = dict.fromkeys(("init", "try_shutdown"), lambda: None)
-        members["rclpy"]["spin"] = self.spun.append
+        members["rclpy"]["spin"] = lambda node, executor=None: self.spun.append(node)
+        members["rclpy.duration"] = {"Duration": dict}
+        members["rclpy.time"] = {"Time": SimpleNamespace(from_msg=lambda stamp: stamp)}
+        members["tf2_ros"] = {
+            "Buffer": lambda: SimpleNamespace(lookup_transform=self._look_up),
+            "TransformException": KeyError,
+            "TransformListener": lambda buffer, node: None,
+        }
+        members["rclpy.callback_groups"] = {"MutuallyExclusiveCallbackGroup": object}
         members["rclpy.node"] = {"Node": self.node_type()}
         shutdown = type("ExternalShutdownException", (Exception,), {})
-        members["rclpy.executors"] = {"ExternalShutdownException": shutdown}
+        members["rclpy.executors"] = {
+            "ExternalShutdownException": shutdown,
+            "MultiThreadedExecutor": lambda num_threads: None,
+        }
         members["rclpy.qos"] = {
             "qos_profile_sensor_data": object(),
             "QoSProfile": lambda **settings: settings,
             "DurabilityPolicy": SimpleNamespace(TRANSIENT_LOCAL=1, VOLATILE=2),
         }
         return {name: SimpleNamespace(**content) for name, content in members.items()}
-
-
-class Slow:
-    """A client that waits for the event `answering` before it gives the answer or the error."""
-
-    def __init__(self, outcome: Any) -> None:
-        self.outcome = outcome
-        self.requests: list[dict[str, Any]] = []
-        self.started, self.answering = threading.Semaphore(0), threading.Event()
-
-    def missing(self, **fields: Any) -> Any:
-        self.requests.append(fields)
-        self.started.release()
-        assert self.answering.wait(PATIENCE)
-        if isinstance(self.outcome, Exception):
-            raise self.outcome
-        return self.outcome
 
 
 def load_package(monkeypatch: pytest.MonkeyPatch, ros: Ros | None = None) -> None:

@@ -1,23 +1,30 @@
-"""The example node against a running service, and its parts alone."""
+"""The ROS 2 node against a running service and against a stand-in of it, and its parts alone."""
 
-import copy
 import importlib
-import json
+import math
+import threading
 from collections.abc import Callable, Iterator
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
-from scene_client import UnreachableError
-from scene_client.vision_msgs import SceneFields
+from scene_client import InvalidRequestError, UnreachableError
+from scene_client.frames import Conventions
+from scene_client.schemas import MissingAnswer
+from tests.client.homes import COMMON, FakeClient
 from tests.client.peers import Peer, answering
-from tests.client.ros_messages import blank
-from tests.deploy.ros import PACKAGE, STORE, Ros, Slow, load_package
+from tests.client.ros_messages import blank, through_cdr
+from tests.deploy.ros import PACKAGE, STORE, Ros, load_package
 from tests.services import PATIENCE, LiveService, in_thread, wait_until
 
 Run = Callable[..., "Running"]
+HOUSE = "kitchen: [[0, 0], [4, 0], [4, 4], [0, 4]]\noffice: [[4, 0], [8, 0], [8, 4], [4, 4]]\n"
+POSE = blank(STORE, "geometry_msgs/msg/PoseWithCovarianceStamped")
+POSE.header.frame_id = "map"
+POSE.pose.pose.position.x, POSE.pose.pose.position.y = 1.0, 2.0
 
 
 def new(name: str, **fields: Any) -> Any:
@@ -25,7 +32,7 @@ def new(name: str, **fields: Any) -> Any:
 
 
 class Running:
-    """The running node: its subscriptions and publications."""
+    """The running node: its subscriptions, publications and services."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, **parameters: Any) -> None:
         self.ros = Ros(parameters)
@@ -37,31 +44,33 @@ class Running:
         assert message.__msgtype__ == kind.ros_name
         callback(message)
 
-    def tick(self) -> None:
-        ((_, callback),) = self.ros.timers
-        callback()
+    def see(self, message: Any, *seconds: float) -> None:
+        """Send one message of detections at these times, and wait for the home each time."""
+        for second in seconds:
+            stamp = message.header.stamp
+            stamp.sec, stamp.nanosec = int(second), int(second % 1 * 1e9)
+            self.hear("detections", message)
+            self.node.home.ask(lambda home: home).result(PATIENCE)
 
     def published(self, topic: str) -> list[Any]:
         return self.ros.publishers[topic].sent
 
-    def wait_for(self, topic: str, count: int = 1) -> Any:
-        """Tick until so many messages are published, and return the last one."""
+    def events(self) -> list[tuple[int, str]]:
+        return [(event.kind, event.label) for event in self.published("~/events")]
 
-        def ticked() -> bool:
-            self.tick()
-            return len(self.published(topic)) == count
-
-        wait_until(ticked)
-        return self.published(topic)[-1]
-
-    def answer(self, message: Any) -> Any:
-        count = len(self.published("~/answers")) + 1
-        self.hear("detections", message)
-        return json.loads(self.wait_for("~/answers", count).data)
+    def call(self, name: str, **fields: Any) -> Any:
+        kind, callback = self.ros.services[name]
+        request = through_cdr(STORE, kind.Request(**fields))
+        return through_cdr(STORE, callback(request, kind.Response()))
 
     def status(self) -> Any:
+        ((_, callback),) = self.ros.timers
+        callback()
         (status,) = self.published("/diagnostics")[-1].status
         return status
+
+    def value(self, key: str) -> str:
+        return {entry.key: entry.value for entry in self.status().values}[key]
 
 
 @pytest.fixture
@@ -74,161 +83,335 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
 
     yield start
     for running in started:
+        if running.ros.destroyed:
+            continue
         running.node.destroy_node()
         assert running.ros.destroyed
 
 
-def test_detections_are_answered(run: Run, live: LiveService, recorded: Any) -> None:
-    running = run(url=live.url, timeout=60.0)
-    answer = running.answer(recorded)
-    assert answer["frame_id"] == "base_link"
-    assert answer["stamp"] == {"sec": 1751450412, "nanosec": 183000000}
+@pytest.fixture
+def rooms(tmp_path: Path) -> str:
+    (tmp_path / "rooms.yaml").write_text(HOUSE)
+    return str(tmp_path / "rooms.yaml")
+
+
+def pretend(running: Running) -> FakeClient:
+    """Replace the service by a stand-in."""
+    client = FakeClient()
+    running.node.counted._client = client
+    return client
+
+
+def detection(label: str, x: float, y: float = 0.0) -> Any:
+    hypothesis = new("ObjectHypothesis", class_id=label, score=0.9)
+    one = new("Detection3D", results=[new("ObjectHypothesisWithPose", hypothesis=hypothesis)])
+    one.bbox.center.position.x, one.bbox.center.position.y = x, y
+    one.bbox.size.x, one.bbox.size.y, one.bbox.size.z = 0.4, 0.6, 0.8
+    return one
+
+
+def array(*detections: Any, frame: str = "base_link") -> Any:
+    message = new("Detection3DArray", detections=list(detections))
+    message.header.frame_id = frame
+    return message
+
+
+def test_a_patrol(run: Run, rooms: str, tmp_path: Path) -> None:
+    """A wrong thing is one event, confirmed by a service, and known after a restart."""
+    files = {"home_file": str(tmp_path / "home.json"), "record": str(tmp_path / "scenes.jsonl")}
+    running = run(rooms=rooms, **files)
+    pretend(running).odd = {"toilet"}
+    running.hear("pose", POSE)
+    running.see(array(detection("oven", 1.0), detection("toilet", 2.0, 1.0)), *range(1, 13))
+    constants = running.ros.modules()["scene_reasoning_msgs.msg"].SceneEvent
+    assert running.events() == [
+        (constants.APPEARED, "oven"),
+        (constants.APPEARED, "toilet"),
+        (constants.OUT_OF_PLACE, "toilet"),
+    ]
+    alarm = running.published("~/events")[-1]
+    assert (alarm.room, alarm.probability, alarm.since.sec) == ("kitchen", 0.9, 2)
+    things = running.published("~/things")[-1]
+    assert things.header.frame_id == "map"
+    toilet = next(one for one in things.things if one.label == "toilet")
+    assert (toilet.id, toilet.room, toilet.alarm) == (alarm.id, "kitchen", constants.OUT_OF_PLACE)
+    position = toilet.pose.position  # of the robot, plus that in its frame
+    assert (position.x, position.y) == pytest.approx((3.0, 3.0))
+    assert (toilet.size.x, toilet.size.y, toilet.size.z) == (0.4, 0.6, 0.8)
+    assert running.status().message == "up to date"
+    assert (running.value("things"), running.value("alarms")) == ("2", "1")
+
+    assert running.call("~/confirm", id=alarm.id).success
+    assert running.events()[-1] == (constants.CLEARED, "toilet")
+    refused = running.call("~/confirm", id="t99")
+    assert (refused.success, refused.message) == (False, "no thing has the id 't99'")
+    running.node.destroy_node()
+    assert "toilet" in (tmp_path / "scenes.jsonl").read_text()
+    again = run(rooms=rooms, **files)
+    assert again.node.home.ask(lambda home: home.confirmed).result() == {("toilet", "kitchen")}
+    pretend(again)
+    again.hear("pose", POSE)
+    again.see(array(detection("oven", 1.0)), 13)
+    assert {one.label for one in again.published("~/things")[-1].things} == {"oven", "toilet"}
+
+
+def test_questions_to_the_service(run: Run, live: LiveService, recorded: Any, rooms: str) -> None:
+    parameters = {"view_angle": 3.0, "view_range": 9.0, "settings.timeout": 60.0}
+    running = run(url=live.url, rooms=rooms, **parameters)
+    running.hear("pose", POSE)
+    running.see(recorded, *range(1, 7))
+    assert running.status().message == "up to date"
+    assert float(running.value("answers/s")) >= 0
     # The machine of this test knows five of the eight things.
-    seen = {entry["object"] for entry in answer["outliers"]["outliers"]}
-    assert seen == {"track_3", "track_5", "track_7", "toilet_1", "book_1"}
-    assert set(answer["missing"]["ignored"]) == {"track_4", "mouse_1", "cup_1"}
-    assert answer["missing"]["observed_relations"]
-    assert [note["reason"] for note in answer["notes"]] == ["no-hypothesis"]
-    (status,) = running.published("/diagnostics")[0].status
-    assert (status.level, status.message) == (0, "answered")
-    clear, *shown = running.published("~/ghosts")[0].markers
+    seen = {one.label for one in running.published("~/things")[-1].things}
+    assert {"desk", "keyboard", "chair", "toilet", "cup"} <= seen
+    missing = MissingAnswer.model_validate_json(running.published("~/missing")[-1].data)
+    assert missing.missing
+    clear, *shown = running.published("~/ghosts")[-1].markers
     assert clear.action == 3
+    assert {marker.header.frame_id for marker in shown} <= {"map"}
     texts = [marker.text for marker in shown if marker.text]
-    best = answer["missing"]["missing"][0]
-    assert len(texts) == 3
-    assert texts[0].startswith(f"{best['label']}? {best['placements'][0]['relation']} ")
-    assert {marker.header.frame_id for marker in shown} == {"base_link"}
+    assert 1 <= len(texts) <= 3
+
+    searched = [blank(STORE, "scene_reasoning_msgs/msg/Searched", room="office")]
+    found = running.call("~/where_is", label="lamp", searched=searched)
+    assert (found.success, found.message, found.header.frame_id) == (True, "", "map")
+    assert {one.room for one in found.rooms} == {"kitchen", "office"}
+    assert sum(one.probability for one in found.rooms) + found.not_here == pytest.approx(1)
+    placed = [one for one in found.places if one.object]
+    assert placed
+    assert all(math.isfinite(one.position.x) for one in placed)
+    probabilities = [one.probability for one in found.places]
+    assert probabilities == sorted(probabilities, reverse=True)
+    unknown = running.call("~/where_is", label="qwzx")
+    assert not unknown.success
+    assert unknown.message.startswith("ProblemError: ")
+    assert not unknown.places
 
 
-def test_parameters_declare_conventions(run: Run, live: LiveService, recorded: Any) -> None:
-    running = run(url=live.url, timeout=60.0, units="cm", up="y")
-    assert running.node.advisor.conventions == {"units": "cm", "up": "y"}
-    for entry in recorded.detections:
-        for vector in (entry.bbox.center.position, entry.bbox.size):
-            for axis in "xyz":
-                setattr(vector, axis, 100 * getattr(vector, axis))
-    assert running.answer(recorded)["missing"]
+def test_positions_are_in_the_frame_of_the_map(run: Run, rooms: str) -> None:
+    def seen(*detections: Any, frame: str) -> list[Any]:
+        running.see(array(*detections, frame=frame), *(next(times) for _ in range(4)))
+        return list(running.node.home.ask(lambda home: home.scene()["objects"]).result())
+
+    running, times = run(rooms=rooms, units="cm"), count(1)
+    pretend(running)
+    oven = detection("oven", 100.0, 50.0)
+    for side in "xyz":
+        setattr(oven.bbox.size, side, 40.0)
+    (label,) = seen(oven, frame="map")  # the pose is unknown
+    assert set(label) == {"id", "label", "confidence"}
+
+    pose = blank(STORE, "geometry_msgs/msg/PoseWithCovarianceStamped")
+    pose.header.frame_id = "map"
+    pose.pose.pose.position.x, pose.pose.pose.position.y = 2.0, 1.0
+    pose.pose.pose.orientation.z = pose.pose.pose.orientation.w = math.sqrt(0.5)  # looks along y
+    running.hear("pose", pose)
+    (placed,) = seen(oven, frame="base_link")
+    assert placed["position"] == pytest.approx([1.5, 2.0, 0.0])
+    assert (placed["size"], placed["yaw"]) == ([0.4] * 3, pytest.approx(math.pi / 2, abs=1e-3))
+
+    optical = detection("sink", 0.0, 0.0)
+    optical.bbox.center.position.z = 120.0  # straight ahead
+    for side in "xyz":
+        setattr(optical.bbox.size, side, 40.0)
+    by_label = {one["label"]: one for one in seen(optical, frame="camera_color_optical_frame")}
+    assert by_label["sink"]["position"] == pytest.approx([2.0, 2.2, 0.0])
+
+    by_label = {one["label"]: one for one in seen(detection("lamp", 300.0, 300.0), frame="map")}
+    assert by_label["lamp"]["position"] == pytest.approx([3.0, 3.0, 0.0])
+    other = {one["label"]: one for one in seen(detection("cup", 300.0), frame="odom")}
+    assert "position" not in other["cup"]
 
 
-def test_the_api_key_comes_from_a_file(run: Run, recorded: Any, tmp_path: Path) -> None:
+def test_tf2_has_the_poses_of_robot_and_camera(run: Run, rooms: str) -> None:
+    """A camera 1 m above the floor, 0.2 m ahead of a robot that looks along y, 30 degrees down."""
+    running = run(rooms=rooms)
+    pretend(running)
+    half, turn = math.sqrt(0.5), importlib.import_module("scene_reasoning.detections").product
+    yaw, pitch = (0.0, 0.0, half, half), (0.0, math.sin(math.pi / 12), 0.0, math.cos(math.pi / 12))
+    camera = turn(turn(yaw, pitch), (-0.5, 0.5, -0.5, 0.5))
+    for frame, place, q in (("base_link", (2, 1, 0), yaw), ("camera_optical", (2, 1.2, 1), camera)):
+        transform = blank(STORE, "geometry_msgs/msg/Transform")
+        for vector, names, values in (
+            (transform.translation, "xyz", place),
+            (transform.rotation, "xyzw", q),
+        ):
+            for name, value in zip(names, values, strict=True):
+                setattr(vector, name, float(value))
+        running.ros.transforms[frame] = transform
+    cup = detection("cup", 0.0)
+    cup.bbox.center.position.z = 1.0  # metres ahead of the camera, in its middle
+    # The box stands upright in the map: its axes in the frame of the camera.
+    x, y, z, w = camera
+    o = turn((-x, -y, -z, w), (0.0, 0.0, 0.0, 1.0))
+    for name, value in zip("xyzw", o, strict=True):
+        setattr(cup.bbox.center.orientation, name, value)
+    running.see(array(cup, frame="camera_optical"), 1, 2, 3)
+    scene = running.node.home.ask(lambda home: home.scene()).result()
+    assert scene["viewpoint"] == pytest.approx({"x": 2.0, "y": 1.0, "yaw": math.pi / 2})
+    (placed,) = scene["objects"]
+    ahead = math.cos(math.pi / 6)
+    assert placed["position"] == pytest.approx([2.0, 1.2 + ahead, 0.5], abs=1e-3)
+    assert placed["size"] == [0.4, 0.6, 0.8]
+    assert placed["yaw"] == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("up", ["z", "y", "-y"])
+def test_a_transform_is_that_of_the_conventions(monkeypatch: pytest.MonkeyPatch, up: Any) -> None:
+    """Rotations to body axes, as `scene_client` knows them."""
+    load_package(monkeypatch)
+    package = importlib.import_module("scene_reasoning.detections")
+    frame = {"z": "base_link", "y": "base_link", "-y": "camera_optical"}[up]
+    message = array(detection("cup", 1.0, 2.0), frame=frame)
+    box = message.detections[0].bbox
+    box.center.position.z = 3.0
+    converter = package.Converter(conventions={"up": "y"} if up == "y" else {})
+    transform = package.Transform.of((0.0, 0.0, 0.0), "map", frame)
+    (moved,) = converter.detections(message, transform)
+    q = box.center.orientation
+    position, size, _ = Conventions(up).box((1.0, 2.0, 3.0), (0.4, 0.6, 0.8), (q.x, q.y, q.z, q.w))
+    assert moved["position"] == pytest.approx(position)
+    assert moved["size"] == size
+
+
+def test_a_room_is_named_by_a_topic(run: Run) -> None:
+    running = run(kind="2d")
+    client = pretend(running)
+    hypothesis = new("ObjectHypothesis", class_id="bed", score=0.9)
+    found = new("Detection2D", results=[new("ObjectHypothesisWithPose", hypothesis=hypothesis)])
+    found.bbox.size_x = found.bbox.size_y = 50.0
+    running.hear("room", blank(STORE, "std_msgs/msg/String", data="bedroom"))
+    running.see(new("Detection2DArray", detections=[found]), *range(1, 6))
+    (bed,) = running.published("~/things")[-1].things
+    assert (bed.label, bed.room) == ("bed", "bedroom")
+    assert math.isnan(bed.pose.position.x)
+    assert math.isnan(bed.size.z)
+    assert client.questions("outliers")[0]["room_type"] == "bedroom"
+
+
+def test_the_api_key_comes_from_a_file(run: Run, tmp_path: Path) -> None:
     (tmp_path / "key").write_text("incorrect-zebra-capacitor-nail\n")
     for file in (str(tmp_path / "key"), ""):
         heads: list[bytes] = []
         with in_thread(Peer(answering(heads=heads))) as peer:
             running = run(url=peer.url, api_key_file=file)
-            running.hear("detections", recorded)
-            running.wait_for("/diagnostics")
+            running.see(array(detection("bed", 1.0)), 1, 2)
         key = b"x-api-key: incorrect-zebra-capacitor-nail\r\n"
         assert (key in heads[0].lower()) is bool(file)
 
 
-def test_only_the_newest_detections_are_sent(run: Run, recorded: Any) -> None:
+def test_callbacks_do_not_wait_and_the_newest_frame_counts(run: Run) -> None:
     running = run()
-    client = running.node.advisor.client = Slow(UnreachableError("gone"))
-    for second in range(4):
-        message = copy.deepcopy(recorded)
+    client = pretend(running)
+    started, answering = threading.Event(), threading.Event()
+
+    def slow(*_: Any, **__: Any) -> Any:
+        started.set()
+        assert answering.wait(PATIENCE)
+        raise UnreachableError("gone")
+
+    client.rooms = slow  # type: ignore[method-assign]
+    message = array(detection("bed", 1.0))
+    for second in range(1, 6):
+        message = array(detection("bed", 1.0))
         message.header.stamp.sec = second
-        running.hear("detections", message)
-        running.tick()  # returns though nobody answers
-        if second == 0:
-            assert client.started.acquire(timeout=PATIENCE)
-    assert running.published("/diagnostics") == []
-    client.answering.set()
-    running.wait_for("/diagnostics", 2)
-    assert [fields["stamp"]["sec"] for fields in client.requests] == [0, 3]
-    first, second_one = (report.status[0] for report in running.published("/diagnostics"))
-    assert first.level == second_one.level == 2
-    assert first.message == "UnreachableError: gone"
-    assert [entry.value for entry in first.values] == ["2"]
-    assert running.published("~/answers") == []
+        running.hear("detections", message)  # returns though nobody answers
+        if second == 1:
+            assert started.wait(PATIENCE)
+    assert running.node.home.replaced == 3
+    assert running.status().message == "no detections"
+    answering.set()
+    wait_until(lambda: running.node.frames == 2)
+    assert running.events()[0] == (8, "lost")
+    status = running.status()
+    assert (status.level, status.message) == (2, "gone")
+    del client.rooms
+    running.see(array(detection("bed", 1.0)), 60, 61, 62)
+    assert (8, "back") in running.events()
+    assert running.status().level == 0
+    assert float(running.value("age of the last answer in s")) < PATIENCE
 
 
-def test_class_ids_need_a_label_map(run: Run, live: LiveService, recorded: Any) -> None:
-    numbers = {"desk": "0", "chair": "1"}
-    for detection in recorded.detections:
-        for result in detection.results:
-            name = result.hypothesis.class_id
-            result.hypothesis.class_id = numbers.get(name, "9")
-    running = run(url=live.url, timeout=60.0)
-    running.hear("detections", recorded)
-    running.wait_for("/diagnostics")
-    assert running.status().message.startswith("MessageError: the class ids are numbers")
-    pairs = numbers.items()
-    classes = [new("VisionClass", class_id=int(n), class_name=name) for name, n in pairs]
+def test_class_ids_need_a_label_map(run: Run) -> None:
+    running = run()
+    pretend(running)
+    message = array(detection("0", 1.0), detection("1", 2.0))
+    running.see(message, 1)
+    status = running.status()
+    assert (status.level, status.message[:40]) == (2, "MessageError: the class ids are numbers:")
+    pairs = enumerate(["desk", "chair"])
+    classes = [new("VisionClass", class_id=number, class_name=name) for number, name in pairs]
     running.hear("label_info", new("LabelInfo", class_map=classes))
-    answer = running.answer(recorded)
-    assert {entry["label"] for entry in answer["outliers"]["outliers"]} == {"desk", "chair"}
+    running.see(message, 2, 3, 4)
+    assert {label for _, label in running.events()} >= {"desk", "chair"}
+    assert running.status().level == 0
 
 
-def test_a_pose_is_the_viewpoint(run: Run, live: LiveService, recorded: Any) -> None:
-    def horizontal() -> list[dict[str, str]]:
-        relations = running.answer(recorded)["missing"]["observed_relations"]
-        return [entry for entry in relations if entry["relation"] in {"left", "front"}]
-
-    running = run(url=live.url, timeout=60.0)
-    for message in (recorded, *recorded.detections):
-        message.header.frame_id = "map"
-    assert horizontal() == []
-
-    pose = blank(STORE, "geometry_msgs/msg/PoseWithCovarianceStamped")
-    pose.header.frame_id = "map"
-    pose.pose.pose.position.x = 5.0
-    pose.pose.pose.orientation.z, pose.pose.pose.orientation.w = 1.0, 0.0
-    running.hear("pose", pose)
-    # From the other side of the desk the chair stands behind it.
-    assert {"subject": "track_3", "relation": "front", "object": "track_7"} in horizontal()
-
-    pose.header.frame_id = "odom"
-    running.hear("pose", pose)
-    assert horizontal() == []
+def test_the_program_spins_the_node_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    ros = Ros({})
+    load_package(monkeypatch, ros)
+    importlib.import_module("scene_reasoning.node").main()
+    assert len(ros.spun) == 1
+    assert ros.destroyed
 
 
-def test_detections_in_images_are_answered(run: Run, live: LiveService) -> None:
-    def detection(name: str, x: float) -> Any:
-        hypothesis = new("ObjectHypothesis", class_id=name, score=0.9)
-        found = new("Detection2D", results=[new("ObjectHypothesisWithPose", hypothesis=hypothesis)])
-        found.bbox.center.position.x = x
-        found.bbox.size_x = found.bbox.size_y = 50.0
-        return found
+def test_an_unexpected_error_ends_the_node(run: Run) -> None:
+    running = run()
+    pretend(running).rooms = lambda *_, **__: 1 / 0  # type: ignore[method-assign,assignment]
+    running.see(array(detection("bed", 1.0)), 1)
+    with pytest.raises(ZeroDivisionError):
+        running.see(array(detection("bed", 1.0)), 2)
+    running.node.home._frame = None
 
-    running = run(url=live.url, timeout=60.0, kind="2d", questions=["outliers"])
-    detections = [detection("bed", 100.0), detection("lamp", 160.0)]
-    answer = running.answer(new("Detection2DArray", detections=detections))
-    (entry,) = answer["outliers"]["misplaced"]
-    assert [*entry.values()][:3] == ["bed_1", "left", "lamp_1"]
+
+def test_a_home_without_things_has_no_places(run: Run) -> None:
+    refused = run().call("~/where_is", label="cup")
+    assert not refused.success
+    assert refused.message.startswith(InvalidRequestError.__name__)
 
 
 def test_ghosts_stand_at_the_offset(monkeypatch: pytest.MonkeyPatch) -> None:
-    load_package(monkeypatch)
-    advisor = importlib.import_module("scene_reasoning.advisor")
-    ghosts = importlib.import_module("scene_reasoning.ghosts").ghosts
-    desk = {"id": "d", "label": "desk", "position": {"x": 1.0, "y": 2.0, "z": 0.4}}
-    fields = SceneFields({"objects": [desk, {"id": "c", "label": "chair"}]})
-    offset = {"mean": {"x": 0.1, "y": -0.2, "z": 0.5}, "std": {"x": 0.2, "y": 0.0, "z": 9.0}}
-    nowhere = {"relation": "front", "object": "c"}
-    there = {"relation": "on-top", "object": "d"}
-    inside = {"relation": "inside", "object": "d", "offset": None}
+    load_package(monkeypatch, Ros({}))
+    messages = importlib.import_module("scene_reasoning.messages")
+    desk = {"id": "d", "label": "desk", "position": [1.0, 2.0, 0.4]}
+    objects = {"d": ("office", desk), "c": ("office", {"id": "c", "label": "chair"})}
+    mean, std = {"x": 0.1, "y": -0.2, "z": 0.5}, {"x": 0.2, "y": 0.0, "z": 9.0}
+    nowhere = {"relation": "front", "object": "c", "probability": 0.5}
+    there = {"relation": "on-top", "object": "d", "probability": 0.5}
+    offset = {"offset": {"mean": mean, "std": std, "scenes": 3}}
     placements: dict[str, list[Any]] = {
         "milk": [],
-        "lamp": [nowhere, there | {"offset": offset}],
+        "lamp": [nowhere, there | offset],
         "bed": [nowhere],
         "cup": [there],
-        "pen": [inside],
+        "pen": [there],
         "book": [there],
     }
-    missing = [{"label": label, "placements": places} for label, places in placements.items()]
-    missing[3] |= {"listed_as": "mug"}
-    lamp, cup, pen = ghosts(advisor.Advice(fields, {"missing": {"missing": missing}}), 3)
-    assert lamp.text == "lamp? on-top desk"
-    assert lamp.position == pytest.approx((1.1, 1.8, 0.9))
-    assert lamp.extent == (0.4, 0.05, 1.5)
-    assert (cup.text, cup.position, cup.extent) == ("mug? on-top desk", (1.0, 2.0, 0.4), None)
-    assert (pen.text, pen.position, pen.extent) == ("pen? inside desk", (1.0, 2.0, 0.4), None)
+    listed = [
+        {"label": label, "probability": 0.5, "log_odds": 0.0, "placements": places}
+        for label, places in placements.items()
+    ]
+    listed[3]["listed_as"] = "mug"
+    answer = MissingAnswer.model_validate(COMMON | {"missing": listed})
+    header = blank(STORE, "std_msgs/msg/Header", frame_id="map")
+    clear, *shown = messages.markers_of(answer, objects, header, 3).markers
+    assert clear.action == 3
+    texts = [marker.text for marker in shown if marker.text]
+    assert texts == ["lamp? on-top desk", "mug? on-top desk", "pen? on-top desk"]
+    (sphere,) = (marker for marker in shown if not marker.text)
+    at, scale = sphere.pose.position, sphere.scale
+    assert (at.x, at.y, at.z) == pytest.approx((1.1, 1.8, 0.9))
+    assert (scale.x, scale.y, scale.z) == (0.4, 0.05, 1.5)
+    at = shown[2].pose.position
+    assert (at.x, at.y, at.z) == (1.0, 2.0, 0.4)
+    assert len({marker.id for marker in shown}) == 4
 
 
 def test_the_parameter_file_has_the_defaults(run: Run) -> None:
     given = yaml.safe_load((PACKAGE / "config" / "scene.yaml").read_text())
     parameters = given["scene"]["ros__parameters"]
+    parameters |= {f"settings.{key}": value for key, value in parameters.pop("settings").items()}
     assert set(run(**parameters).ros.declared) == set(parameters)
     defaults = run().ros.declared
     for name, value in defaults.items():

@@ -1,5 +1,6 @@
 """The programs of `examples/`, each with the shipped models."""
 
+import copy
 import json
 import os
 import runpy
@@ -10,9 +11,10 @@ from typing import Any
 
 import pytest
 
+from tests.client.ros_messages import blank
 from tests.conftest import REPOSITORY, FindTool, run_program
-from tests.deploy.ros import Ros, from_json
-from tests.services import LiveService, wait_until
+from tests.deploy.ros import STORE, Ros, from_json
+from tests.services import LiveService
 
 pytestmark = pytest.mark.system
 
@@ -79,13 +81,16 @@ def test_the_python_program_reports_a_missing_service() -> None:
 
 def test_the_behaviour_tree_says_why_its_conditions_fail(shipped: LiveService) -> None:
     printed = run_python("behaviour_tree.py", shipped.url).stdout.splitlines()
-    assert printed[0].startswith("fits: toilet_1: an outlier with probability 0.9")
+    assert printed[0].startswith("belongs: toilet t7: out-of-place, 0.9")
     assert printed[1].startswith("complete: missing: computer")
 
 
-def test_the_ros_node_publishes_outliers(shipped, monkeypatch):
+def test_the_ros_node_publishes_events(shipped, monkeypatch):
     recorded = json.loads((REPOSITORY / "clients/ros2/detections.json").read_text("utf-8"))
     message = from_json("vision_msgs/msg/Detection3DArray", recorded["msg"])
+    unnamed = copy.deepcopy(message.detections[0])
+    unnamed.results = unnamed.results[:1]
+    unnamed.results[0].hypothesis.class_id = "7"
     for url in (shipped.url, "http://127.0.0.1:9"):
         ros = Ros({})
         for name, module in ros.modules().items():
@@ -95,15 +100,16 @@ def test_the_ros_node_publishes_outliers(shipped, monkeypatch):
         (node,) = ros.spun
         kind, callback = ros.subscriptions["detections"]
         assert kind.ros_name == message.__msgtype__
-        node.scene.options = replace(node.scene.options, timeout=60)  # the machine is busy
-        node.asked.result()  # a message that comes earlier is not asked about
-        callback(message)
-        sent = ros.publishers["~/outliers"].sent
-        wait_until(lambda sent=sent, ros=ros: sent or ros.warned)
+        node.home.settings = replace(node.home.settings, timeout=60)  # the machine is busy
+        messages = [*[message] * 10, blank(STORE, kind.ros_name, detections=[unnamed])]
+        for one in messages:
+            node.updated.result()  # a message that comes earlier is left out
+            one.header.stamp.sec += 1
+            callback(one)
         node.thread.shutdown()
         node.scene.close()
-        if url == shipped.url:
-            assert [published.data for published in sent] == ["toilet_1"]
-        else:
-            assert not sent
-            assert ros.warned[0].startswith("UnreachableError: ")
+        sent = [published.data for published in ros.publishers["~/events"].sent]
+        assert {"appeared desk", "appeared chair"} <= set(sent)
+        assert ("out-of-place toilet" in sent) is (url == shipped.url)
+        assert ("service lost" in sent) is (url != shipped.url)
+        assert [text[:40] for text in ros.warned] == ["MessageError: the class ids are numbers:"]

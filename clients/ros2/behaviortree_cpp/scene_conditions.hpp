@@ -7,10 +7,11 @@
 //     <SceneComplete scene="{scene}" because="{why}"/>
 //     <ObjectBelongs scene="{scene}" object="cup_1"/>
 //
-// `scene` is a request as JSON text (docs/robots.md). The first tick of a condition starts a
-// question in a separate thread. The condition is RUNNING until the answer arrives, so a tick never
-// waits. A condition fails if the scene has no objects, or if no answer arrives within the client's
-// timeout. `because` gives the reason.
+// `scene` is a request about one room as JSON text (docs/robots.md). C++ has no `Home`, so a moving
+// robot makes it from the topic ~/things of the ROS 2 node: single frames have wrong labels. The
+// first tick of a condition starts a question in a separate thread. The condition is RUNNING until
+// the answer arrives, so a tick never waits. A condition fails if the scene has no objects, or if no
+// answer arrives within the client's timeout. `because` gives the reason.
 #pragma once
 
 #include <behaviortree_cpp/action_node.h>

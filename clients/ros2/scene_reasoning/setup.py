@@ -14,6 +14,6 @@ setup(
     ],
     install_requires=["setuptools", "scene-client"],
     zip_safe=True,
-    description="Asks a scene-reasoning service about a robot's detections",
+    description="What a moving robot knows about a home",
     entry_points={"console_scripts": [f"scene = {NAME}.node:main"]},
 )

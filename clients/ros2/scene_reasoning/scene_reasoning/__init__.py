@@ -1,1 +1,1 @@
-"""Ask the scene-reasoning service about a robot's detections."""
+"""What a moving robot knows about a home: a ROS 2 node, and conditions for py_trees."""

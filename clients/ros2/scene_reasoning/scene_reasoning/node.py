@@ -1,179 +1,295 @@
-"""ROS 2 node that asks the service about detections, and publishes answers and markers.
+"""ROS 2 node that holds a `scene_client.Home`: what a moving robot knows about the rooms of a home.
 
 Subscriptions: ``detections`` (vision_msgs/Detection3DArray or Detection2DArray), ``label_info``
-(vision_msgs/LabelInfo) and ``pose`` (geometry_msgs/PoseWithCovarianceStamped).
-Publications: ``~/answers`` (std_msgs/String, JSON), ``~/ghosts`` (visualization_msgs/MarkerArray)
-and ``/diagnostics``.
-Questions run in a separate thread, so callbacks never wait for the service.
+(vision_msgs/LabelInfo), ``pose`` (geometry_msgs/PoseWithCovarianceStamped; without it, tf2 has the
+pose) and ``room`` (std_msgs/String).
+Publications: ``~/events`` and ``~/things`` (scene_reasoning_msgs), ``~/missing`` (std_msgs/String,
+JSON), ``~/ghosts`` (visualization_msgs/MarkerArray) and ``/diagnostics``.
+Services: ``~/where_is`` and ``~/confirm`` (scene_reasoning_msgs).
+The home has its own thread, so the callbacks of messages never wait for the service.
 """
 
 from __future__ import annotations
 
-import json
 import math
+import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import rclpy
+import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from rclpy.executors import ExternalShutdownException
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.duration import Duration
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
-from std_msgs.msg import String
+from rclpy.time import Time
+from scene_reasoning_msgs.msg import RoomProbability, SceneEvent, ThingArray
+from scene_reasoning_msgs.srv import Confirm, WhereIs
+from std_msgs.msg import Header, String
+from tf2_ros import Buffer, TransformException, TransformListener
 from vision_msgs.msg import Detection2DArray, Detection3DArray, LabelInfo
-from visualization_msgs.msg import Marker, MarkerArray
+from visualization_msgs.msg import MarkerArray
 
-from scene_client import Client, ClientError
+from scene_client import Client, ClientError, Event, Home, Settings
 from scene_client.frames import CONVENTIONS
-from scene_client.ros_fields import MessageError
-from scene_reasoning.advisor import Advice, Advisor
-from scene_reasoning.ghosts import Ghost, ghosts
-from scene_reasoning.latest import Latest, Outcome
+from scene_client.ros_fields import MessageError, frame_of
+from scene_reasoning import messages
+from scene_reasoning.detections import Converter, Pose, Transform
+from scene_reasoning.home_thread import HomeThread
 
 KINDS = {"3d": Detection3DArray, "2d": Detection2DArray}
 
-# A message of detections, and the viewpoint (x, y in metres, yaw in radians) at its arrival.
-Seen = tuple[Any, "tuple[float, float, float] | None"]
+
+class Counted:
+    """A client that counts its answers."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+        self.answers, self.last = 0, math.nan  # number, and time of the last one
+
+    def __getattr__(self, name: str) -> Any:
+        ask = getattr(self._client, name)
+
+        def counted(*arguments: Any, **fields: Any) -> Any:
+            answer = ask(*arguments, **fields)
+            self.answers, self.last = self.answers + 1, time.monotonic()
+            return answer
+
+        return counted
 
 
 class SceneNode(Node):
-    """Ask about the newest detections, and publish the answers."""
+    """Update a home with each message of detections, and publish its changes."""
 
     def __init__(self) -> None:
         super().__init__("scene")
-        self.ghosts_shown = self._parameter("ghosts", 3)
-        key_file = self._parameter("api_key_file", "")
+        defaults = asdict(Settings())
+        settings = Settings(**{n: self._parameter(f"settings.{n}", defaults[n]) for n in defaults})
+        key_file, rooms = self._parameter("api_key_file", ""), self._parameter("rooms", "")
         self.client = Client(
             self._parameter("url", "http://127.0.0.1:8000"),
-            timeout=self._parameter("timeout", 0.5),
+            timeout=settings.timeout,
             api_key=Path(key_file).read_text("utf-8").strip() if key_file else None,
+        )
+        self.counted: Any = Counted(self.client)
+        view = self._parameter("view_angle", 0.0), self._parameter("view_range", 0.0)
+        candidates = list(self._parameter("room_candidates", [""]))
+        home = Home(
+            self.counted,
+            yaml.safe_load(Path(rooms).read_text("utf-8")) if rooms else None,
+            path=self._parameter("home_file", "") or None,
+            view=view if all(view) else None,
+            room_candidates=candidates if any(candidates) else (),
             record=self._parameter("record", "") or None,
+            settings=settings,
         )
+        self.home = HomeThread(home)
         names = list(self._parameter("class_names", [""]))
-        self.advisor = Advisor(
-            self.client,
-            questions=tuple(self._parameter("questions", ["missing", "outliers"])),
-            label_map=self._parameter("label_map", "") or (names if any(names) else None),
-            min_score=self._parameter("min_score", 0.2),
-            unknown_labels=self._parameter("unknown_labels", "nearest-or-ignore"),
-            boxes=self._parameter("boxes", True),
-            conventions={
-                name: value for name in CONVENTIONS if (value := self._parameter(name, ""))
-            },
+        self.converter = Converter(
+            self._parameter("label_map", "") or (names if any(names) else None),
+            self._parameter("min_score", 0.2),
+            self._parameter("boxes", True),
+            {name: value for name in CONVENTIONS if (value := self._parameter(name, ""))},
         )
-        self.latest: Latest[Seen, Advice] = Latest(lambda seen: self.advisor.advise(*seen))
-        # The default NaN means that the viewpoint is unknown until the first pose.
+        # The default NaN means that tf2 has the pose, until the first message with a pose.
         viewpoint = tuple(self._parameter("viewpoint", [math.nan] * 3))
-        self.viewpoint = viewpoint if all(map(math.isfinite, viewpoint)) else None
-        self.pose_frame: str | None = None
-
-        kind = KINDS[self._parameter("kind", "3d")]
-        self.create_subscription(kind, "detections", self.on_detections, qos_profile_sensor_data)
-        # A transient-local subscription gets the last message of publishers that started earlier,
-        # but does not match volatile publishers. So each topic has both kinds of subscription.
-        for durability in (DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE):
-            qos = QoSProfile(depth=1, durability=durability)
-            self.create_subscription(LabelInfo, "label_info", self.on_label_info, qos)
-            self.create_subscription(PoseWithCovarianceStamped, "pose", self.on_pose, qos)
-        self.answers = self.create_publisher(String, "~/answers", 1)
-        self.markers = self.create_publisher(MarkerArray, "~/ghosts", 1)
-        self.diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 1)
-        self.create_timer(1.0 / self._parameter("rate", 10.0), self.on_tick)
+        self.pose: Pose | None = viewpoint if all(map(math.isfinite, viewpoint)) else None
+        self.pose_frame, self.map_frame = "", self._parameter("map_frame", "map")
+        self.base_frame = self._parameter("base_frame", "base_link")
+        self.transforms = Buffer()
+        self.listener = TransformListener(self.transforms, self)
+        self.room: str | None = None
+        self.missing_period = self._parameter("missing_period", 5.0)
+        self.ghosts_shown = self._parameter("ghosts", 3)
+        self.header = Header(frame_id=self.map_frame)  # of the last frame
+        self.next: dict[str, float] = {}  # times of the next publications, by topic
+        # What the thread of the home reports to the diagnostics.
+        self.frames, self.error, self.lost = 0, "", ""
+        self.state: dict[str, Any] = {}
+        self.reported = time.monotonic(), 0, 0
+        self._connect(KINDS[self._parameter("kind", "3d")])
 
     def _parameter(self, name: str, default: Any) -> Any:
         return self.declare_parameter(name, default).value
 
+    def _connect(self, kind: Any) -> None:
+        self.create_subscription(kind, "detections", self.on_detections, qos_profile_sensor_data)
+        # A transient-local subscription gets the last message of publishers that started earlier,
+        # but does not match volatile publishers. So each topic has both kinds of subscription.
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        for qos in (latched, QoSProfile(depth=1, durability=DurabilityPolicy.VOLATILE)):
+            self.create_subscription(LabelInfo, "label_info", self.on_label_info, qos)
+            self.create_subscription(PoseWithCovarianceStamped, "pose", self.on_pose, qos)
+            self.create_subscription(String, "room", self.on_room, qos)
+        self.events = self.create_publisher(SceneEvent, "~/events", 100)
+        self.things = self.create_publisher(ThingArray, "~/things", latched)
+        self.missing = self.create_publisher(String, "~/missing", 1)
+        self.markers = self.create_publisher(MarkerArray, "~/ghosts", 1)
+        self.diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 1)
+        self.create_timer(1.0, self.on_second)
+        # A service waits for the thread of the home, in a group of its own: other callbacks go on.
+        waiting = MutuallyExclusiveCallbackGroup()
+        self.create_service(WhereIs, "~/where_is", self.on_where_is, callback_group=waiting)
+        self.create_service(Confirm, "~/confirm", self.on_confirm, callback_group=waiting)
+
     # ---------------------------------------------------------------------------- callbacks
 
     def on_detections(self, message: Any) -> None:
-        # A pose is valid only for detections in its frame. Without a pose, the viewpoint of the
-        # parameter is valid in every frame.
-        is_valid = self.pose_frame in (None, message.header.frame_id)
-        self.latest.see((message, self.viewpoint if is_valid else None))
+        stamp = message.header.stamp
+        if not (stamp.sec or stamp.nanosec):
+            stamp = self.get_clock().now().to_msg()
+        pose, frame, room = self.pose, self.pose_frame, self.room
+        self.home.see(lambda home: self._update(home, message, stamp, pose, frame, room))
 
     def on_label_info(self, message: Any) -> None:
-        self.advisor.label_map = message
+        self.converter.label_map = message
 
     def on_pose(self, message: Any) -> None:
-        position, q = message.pose.pose.position, message.pose.pose.orientation
-        # Yaw of the unit quaternion q, in radians.
-        yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
-        self.viewpoint = (position.x, position.y, yaw)
+        self.pose = _transform(message.pose.pose.position, message.pose.pose.orientation).pose
         self.pose_frame = message.header.frame_id
 
-    def on_tick(self) -> None:
-        outcome = self.latest.tick()
-        if outcome is None:
-            return
-        message, _ = outcome.about
-        try:
-            advice = outcome.future.result()
-        except (ClientError, MessageError) as error:
-            # Any other error is a defect of the node, and ends the node.
-            self._report(DiagnosticStatus.ERROR, outcome, f"{type(error).__name__}: {error}")
-            return
-        self.answers.publish(String(data=json.dumps(advice.to_json())))
-        self.markers.publish(self._markers(message, ghosts(advice, self.ghosts_shown)))
-        if advice.answers:
-            self._report(DiagnosticStatus.OK, outcome, "answered")
-        else:
-            self._report(DiagnosticStatus.WARN, outcome, "nothing was seen")
+    def on_room(self, message: Any) -> None:
+        self.room = message.data or None
 
-    # ------------------------------------------------------------------------------ messages
+    def on_where_is(self, request: Any, response: Any) -> Any:
+        return self.home.ask(lambda home: self._where_is(home, request, response)).result()
 
-    def _markers(self, message: Any, shown: list[Ghost]) -> MarkerArray:
-        """Return the markers of ghosts: a text, and a sphere if the extent is known.
+    def on_confirm(self, request: Any, response: Any) -> Any:
+        return self.home.ask(lambda home: self._confirm(home, request, response)).result()
 
-        The first marker deletes all earlier markers.
-        """
-        clear = Marker()
-        clear.header = message.header
-        clear.action = Marker.DELETEALL
-        markers = [clear]
-        for ghost in shown:
-            kinds = [Marker.TEXT_VIEW_FACING]
-            if ghost.extent is not None:
-                kinds.append(Marker.SPHERE)
-            for kind in kinds:
-                marker = Marker()
-                marker.header = message.header
-                marker.ns = "missing"
-                marker.id = len(markers)
-                marker.type = kind
-                marker.action = Marker.ADD
-                place = marker.pose.position
-                place.x, place.y, place.z = ghost.position
-                colour = marker.color
-                colour.r, colour.g, colour.b = 1.0, 0.6, 0.0
-                if kind == Marker.SPHERE and ghost.extent is not None:
-                    marker.scale.x, marker.scale.y, marker.scale.z = ghost.extent
-                    colour.a = 0.35
-                else:
-                    marker.text = ghost.text
-                    marker.scale.z = 0.08
-                    colour.a = 1.0
-                markers.append(marker)
-        return MarkerArray(markers=markers)
-
-    def _report(self, level: Any, outcome: Outcome[Seen, Advice], text: str) -> None:
-        status = DiagnosticStatus(level=level, name=f"{self.get_name()}: service", message=text)
-        status.values = [KeyValue(key="superseded", value=str(outcome.superseded))]
+    def on_second(self) -> None:
+        """Report rates since the last report, and the state of the home."""
+        now, frames, answers = time.monotonic(), self.frames, self.counted.answers
+        since, old_frames, old_answers = self.reported
+        self.reported = now, frames, answers
+        level, text = DiagnosticStatus.OK, "up to date"
+        if self.lost or self.error:
+            level, text = DiagnosticStatus.ERROR, self.lost or self.error
+        elif frames == old_frames:
+            level, text = DiagnosticStatus.WARN, "no detections"
+        values = {
+            "frames/s": f"{(frames - old_frames) / max(now - since, 1e-3):.1f}",
+            "answers/s": f"{(answers - old_answers) / max(now - since, 1e-3):.1f}",
+            "age of the last answer in s": f"{now - self.counted.last:.1f}",
+            "replaced frames": self.home.replaced,
+            **self.state,
+        }
+        status = DiagnosticStatus(level=level, name=f"{self.get_name()}: home", message=text)
+        status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
         report = DiagnosticArray(status=[status])
         report.header.stamp = self.get_clock().now().to_msg()
         self.diagnostics.publish(report)
 
+    # ------------------------------------------------------------- in the thread of the home
+
+    def _update(
+        self, home: Home, message: Any, stamp: Any, pose: Any, pose_frame: str, room: str | None
+    ) -> None:
+        self.header = Header(stamp=stamp, frame_id=pose_frame or self.map_frame)
+        frame = frame_of(message.header)
+        if pose is not None:
+            transform = Transform.of(pose, pose_frame, frame)
+        elif transform := self._look_up(frame, stamp):
+            base = self._look_up(self.base_frame, stamp)
+            pose = None if base is None else base.pose
+        try:
+            detections = self.converter.detections(message, transform)
+            events = home.update(detections, pose, stamp, room=room)
+            self._publish(home, events)
+            self._publish_missing(home)
+            self.error = ""
+        except (ClientError, MessageError) as error:
+            # Any other error is a defect of the node, and ends the node.
+            self.error = f"{type(error).__name__}: {error}"
+        self.frames += 1
+
+    def _look_up(self, frame: str, stamp: Any) -> Transform | None:
+        """Return the transform from a frame to the map, or None if tf2 does not have it soon."""
+        at, patience = Time.from_msg(stamp), Duration(seconds=0.2)
+        try:
+            found = self.transforms.lookup_transform(self.map_frame, frame, at, patience).transform
+        except TransformException:
+            return None
+        return _transform(found.translation, found.rotation)
+
+    def _publish(self, home: Home, events: list[Event]) -> None:
+        for event in events:
+            self.events.publish(messages.event_of(event))
+            if event.kind == "service":
+                self.lost = event.detail or "lost" if event.label == "lost" else ""
+        if not self._is_due("things", 1.0) and not events:
+            return
+        alarms, things = home.alarms, messages.present(home)
+        self.state = {"things": len(things), "alarms": len(alarms), "room": home.room}
+        found = messages.things_of(things, alarms)
+        self.things.publish(ThingArray(header=self.header, things=found))
+
+    def _is_due(self, topic: str, period: float) -> bool:
+        """Return whether a period in seconds has passed since the last publication."""
+        now = time.monotonic()
+        if is_due := now >= self.next.get(topic, now):
+            self.next[topic] = now + period
+        return is_due
+
+    def _publish_missing(self, home: Home) -> None:
+        if self.missing_period <= 0 or self.lost or not home.scene()["objects"]:
+            return
+        if not self._is_due("missing", self.missing_period):
+            return
+        answer, things = home.missing(), messages.present(home)
+        self.missing.publish(String(data=answer.model_dump_json(exclude_none=True)))
+        shown = messages.markers_of(answer, things, self.header, self.ghosts_shown)
+        self.markers.publish(shown)
+
+    def _where_is(self, home: Home, request: Any, response: Any) -> Any:
+        searched = [
+            {
+                "room": one.room,
+                "object": one.object or None,
+                "seen_share": one.seen_share or 1.0,
+            }
+            for one in request.searched
+        ]
+        try:
+            answer = home.where(request.label, searched)
+        except ClientError as error:
+            response.success, response.message = False, f"{type(error).__name__}: {error}"
+            return response
+        response.success, response.header = True, self.header
+        response.places = messages.places_of(answer, messages.present(home))
+        response.rooms = [
+            RoomProbability(room=one.room, probability=one.probability) for one in answer.rooms
+        ]
+        response.not_here = answer.not_here
+        return response
+
+    def _confirm(self, home: Home, request: Any, response: Any) -> Any:
+        try:
+            self._publish(home, home.confirm(request.id))
+            response.success = True
+        except KeyError:
+            response.success, response.message = False, f"no thing has the id {request.id!r}"
+        return response
+
     def destroy_node(self) -> None:
-        self.latest.close()
+        self.home.close()
         self.client.close()
         super().destroy_node()
+
+
+def _transform(position: Any, q: Any) -> Transform:
+    return Transform((q.x, q.y, q.z, q.w), (position.x, position.y, position.z))
 
 
 def main() -> None:
     rclpy.init()
     node = SceneNode()
     try:
-        rclpy.spin(node)
+        rclpy.spin(node, MultiThreadedExecutor(num_threads=2))
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
