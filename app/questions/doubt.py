@@ -15,9 +15,10 @@ A probable intruder and a probably wrong detection say little about the scene. S
 weight the presence of an object of class i by real · (1 - sigmoid(l_i)) (`believed`). The room type
 has a mixture over the hypotheses that nothing, or one class k, is an intruder (`room_log_p`):
 
-    p(t) = (p(t | v) + sum_k w_k p(t | v without k)) / (1 + sum_k w_k),   w_k = exp(l_k + `PRIOR`)
+    p(t) = (p(t | v) + sum_k w_k p(t | v without k)) / (1 + sum_k w_k),   w_k = exp(l_k) (e n / N)²
 
-The sum is over the `HYPOTHESES` classes with the largest l_k.
+The sum is over the `HYPOTHESES` classes with the largest l_k. n is at most N = `LONG_LIST`. A short
+list rarely has an intruder, and says too little without one of its classes.
 
 The doubt about classes that are not judged, and about a single class, is that of the detector
 alone: s_i counts as 0.
@@ -41,7 +42,7 @@ from app.questions.posterior import Posterior
 from app.scene.scene import Scene, pool_classes
 
 HYPOTHESES: Final = 4
-PRIOR: Final = 2.0  # log-odds; it costs less of the room types with an intruder than 0, 1 and 3
+LONG_LIST: Final = 12  # classes; of the prior exponents 0, 1, 2 and 3, 2 gives the best room types
 _LARGEST: Final = 50.0  # log weight of a hypothesis
 _SMALLEST: Final = 1e-300  # probability of a room type
 _LEAST_WEIGHT: Final = 1e-3  # of all hypotheses together
@@ -155,7 +156,8 @@ def room_log_p(
     posterior.weight(about.exists)
     log_p = posterior.room_log_p()
     chosen = np.argsort(-about.logits, kind="stable")[:HYPOTHESES]
-    weights = np.exp(np.minimum(about.logits[chosen] + PRIOR, _LARGEST))
+    prior = 2.0 + 2.0 * math.log(min(max(posterior.listed, 1), LONG_LIST) / LONG_LIST)
+    weights = np.exp(np.minimum(about.logits[chosen] + prior, _LARGEST))
     total = float(weights.sum())
     if posterior.listed < 2 or total < _LEAST_WEIGHT:
         return posterior, log_p

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from app.model import RealFit
 from app.model.calibration import CountSlope
-from app.questions.doubt import PRIOR, believed, doubt, room_log_p
+from app.questions.doubt import LONG_LIST, believed, doubt, room_log_p
 from app.questions.posterior import Posterior
 from app.scene import Scene
 from tests.questions.answers import misplaced, missing, outliers, rooms
@@ -174,7 +174,7 @@ def test_the_room_type_is_a_mixture_over_the_intruder(name):
     for row, index in enumerate(classes):
         if row != least:
             others = [one for one in classes if one != index]
-            weight = math.exp(logits[row] + PRIOR)
+            weight = math.exp(logits[row]) * (math.e * 5 / LONG_LIST) ** 2
             p = p + weight * np.exp(Posterior(artifact, scene_of(others)).room_log_p())
             total += weight
     _, log_p = room_log_p(artifact, scene_of(classes, room=1))
