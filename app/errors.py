@@ -130,8 +130,15 @@ class RequestError(ServiceError):
         super().__init__(detail or f"{counted}, listed in `errors`.{self._hint}", errors=errors)
 
     def below(self, at: Location) -> Self:
-        """Return the error with ``at`` in front of the location of each of its errors."""
-        return type(self)([replace(one, location=(*at, *one.location)) for one in self.located])
+        """Return the error about a scene at a location of the request.
+
+        Other locations than those of objects are of fields that all scenes share.
+        """
+        of_objects = [
+            replace(one, location=(*at, *one.location)) if one.location[:1] == ("objects",) else one
+            for one in self.located
+        ]
+        return type(self)(of_objects)
 
     def locate(self, body: Any, at: Location = ()) -> None:
         """Convert the located errors to `errors` with JSON pointers. A second call has no effect.

@@ -40,8 +40,17 @@ async def confirm(data: ConfirmRequest, http: Request) -> bytes:
     def write(_: object) -> str:
         """Check the scene as a question does, and write it."""
         unknown = Unknown(artifact.model.vocabulary, data.unknown_labels, LookUps())
-        read_for(data, artifact, runtime.limits, unknown)
-        scene_id = None if recorder is None else recorder.confirm(data)
+        reading = read_for(data, artifact, runtime.limits, unknown)
+        decided = {one.object for one in reading.resolved}
+        label_of = {one.id: one.label for one in reading.scene.objects if one.id in decided}
+        objects = [
+            one
+            if isinstance(one, str) or (label := label_of.get(one.id or one.label)) is None
+            else one.model_copy(update={"label": label})
+            for one in data.objects
+        ]
+        scene = data.model_copy(update={"objects": objects})
+        scene_id = None if recorder is None else recorder.confirm(scene)
         if scene_id is None:
             raise NotRecordedError
         return scene_id

@@ -127,7 +127,9 @@ def _read(
         options: dict[str, Any] = {"scene": reading.scene, **question.read(request, model, reading)}
     else:
         rooms = [read(room, at=("rooms", k)) for k, room in enumerate(question.rooms_of(request))]
-        reading, options = together(rooms), question.read(request, model, rooms)
+        names = [room.id for room in cast("WhereRequest", request).rooms]
+        reading = together(dict(zip(names, rooms, strict=True)))
+        options = question.read(request, model, rooms)
     words = list(unknown.words.values())
     enlarged = model.with_words(words) if words else model
     if question.rooms_of is None and not question.samples:
@@ -181,7 +183,8 @@ def _too_large(question: Question[Any], most: int) -> AnswerTooLargeError:
 QUICK_OBJECTS: Final = 32
 QUICK_ENTRIES: Final = 256
 QUICK_LABELS: Final = 2
-"""Largest scene, lists and number of new labels of a question that the event loop computes.
+QUICK_ROOMS: Final = 8
+"""Largest scene, lists, number of new labels and rooms of a question that the event loop computes.
 
 Such a question takes about 2 ms.
 """
@@ -190,7 +193,11 @@ Such a question takes about 2 ms.
 def is_quick(request: SceneRequest | WhereRequest, vocabulary: Vocabulary) -> bool:
     """Return whether the event loop may compute a question about a scene or a home."""
     objects = objects_of(request)
-    is_little = len(objects) <= QUICK_OBJECTS and is_small(vars(request))
+    several = sum(len(one.alternatives) for one in objects if not isinstance(one, str))
+    is_little = len(objects) <= QUICK_OBJECTS and several <= QUICK_OBJECTS
+    if isinstance(request, WhereRequest):
+        is_little &= len(request.rooms) <= QUICK_ROOMS
+    is_little &= is_small(vars(request))
     return is_little and new_labels(request, objects, vocabulary) <= QUICK_LABELS
 
 

@@ -112,11 +112,13 @@ class SceneModel:
 
     @cached_property
     def room_prior(self) -> Float[NDArray[np.float64], "C"]:
-        """log p(t) of each room type t in a scene without objects."""
-        if not self.spec.C:
-            return np.zeros(0)
+        """log p(t) of each room type t in a scene without objects and without a profile."""
+        return self.empty_room_log_p(None) if self.spec.C else np.zeros(0)
+
+    def empty_room_log_p(self, profile: int | None) -> Float[NDArray[np.float64], "C"]:
+        """Return log p(t) of each room type t in a scene without objects."""
         c1, nothing = self.weights["c1"], np.zeros(0, np.int64)
-        return self.objects.room_log_p(c1[None], nothing, np.zeros((1, 0), np.float32), None)[0]
+        return self.objects.room_log_p(c1[None], nothing, np.zeros((1, 0), np.float32), profile)[0]
 
     @cached_property
     def room_evidence(self) -> Float[NDArray[np.float32], "V C"]:

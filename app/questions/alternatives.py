@@ -48,7 +48,11 @@ class Guesses:
 def read_guesses(
     entry: Detection, name: str, at: Location, unknown: Unknown, errors: ErrorList
 ) -> Guesses:
-    """Return the known labels of an object. Labels of one class count as one, with both shares."""
+    """Return the known labels of an object. Labels of one class count as one, with both shares.
+
+    An unknown label adds an error only if the object has no known label.
+    """
+    own = ErrorList()
     labels: list[str] = []
     classes: list[int] = []
     shares: list[float] = []
@@ -57,13 +61,15 @@ def read_guesses(
     for number, other in enumerate(entry.alternatives):
         stated.append((other.label, other.confidence, (*at, "alternatives", number, "label")))
     for label, confidence, location in stated:
-        index = unknown.resolve(label, name, location, errors)
+        index = unknown.resolve(label, name, location, own)
         if index in classes:
             shares[classes.index(index)] += confidence
         elif index is not None:
             labels.append(label)
             classes.append(index)
             shares.append(confidence)
+    for kind, located in () if classes else own.by_class.items():
+        errors.by_class.setdefault(kind, []).extend(located)
     # The object is ignored once if no label is known, and not at all otherwise.
     del unknown.ignored[before + (not classes) :]
     return Guesses(labels, classes, shares)

@@ -15,7 +15,7 @@ from pydantic_core import from_json, to_json, to_jsonable_python
 
 from app.compiling import compiled
 from app.questions.posterior import Present
-from app.questions.reading import Reading
+from app.questions.reading import Decision, Reading
 from app.scene.scene import Scene
 from scene_client.schemas import ModelReference, SceneRequest, WhereRequest
 
@@ -51,13 +51,17 @@ def envelope(
     if reading.observed is not None:
         fields["observed_relations"] = reading.observed
     if reading.resolved:
-        fields["resolved"] = [
-            {"object": name, "labels": [
-                {"label": label, "probability": rounded_number(value)}
-                for label, value in zip(labels, p, strict=True)
-            ]}
-            for name, labels, p in reading.resolved
-        ]  # fmt: skip
+        fields["resolved"] = [_resolved(one) for one in reading.resolved]
+    return fields
+
+
+def _resolved(decision: Decision) -> Fields:
+    """Return the fields of `scene_client.schemas.Resolved`."""
+    fields: Fields = {"object": decision.object}
+    if decision.room is not None:
+        fields["room"] = decision.room
+    pairs = zip(decision.labels, decision.probabilities, strict=True)
+    fields["labels"] = [{"label": x, "probability": rounded_number(p)} for x, p in pairs]
     return fields
 
 

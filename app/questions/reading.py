@@ -50,7 +50,8 @@ from scene_client.schemas.answers import WarningCode
 Decide = Callable[[Sequence[Word], Scene, Mapping[int, Guesses]], dict[int, NDArray[Any]]]
 """Function that returns the probabilities of the labels of objects: `label_probabilities`."""
 
-_LEAST_CONFIDENCE: Final = 1e-6
+_LEAST_CONFIDENCE: Final = 1e-6  # a smaller one counts as this; float32 divides by it
+_MOST_LABELS: Final = 512  # labels of all objects with alternatives
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +61,16 @@ class Limits:
     objects: int = 256
     relations: int = 4096
     answer_bytes: int = 16 * 2**20
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """The labels of one object with alternatives."""
+
+    object: str  # id
+    labels: Sequence[str]  # classes, likeliest first
+    probabilities: Sequence[float]
+    room: str | None = None  # id of its room in a home
 
 
 @dataclass
@@ -72,8 +83,7 @@ class Reading:
     vocabulary: Vocabulary  # classes of the model, and of words that are read by their meaning
     observed: list[ObservedRelation] | None = None  # derived from poses; None: without poses
     warnings: list[SceneWarning] = field(default_factory=list)
-    # Ids of the objects with several labels; their classes, likeliest first, and probabilities.
-    resolved: list[tuple[str, list[str], list[float]]] = field(default_factory=list)
+    resolved: list[Decision] = field(default_factory=list)
 
     @cached_property
     def names(self) -> Names:
@@ -81,13 +91,13 @@ class Reading:
         return Names(self.scene.objects, self.unknown, self.left_out)
 
 
-def together(rooms: Sequence[Reading]) -> Reading:
-    """Return a reading without objects, with the notes on all rooms of a home."""
-    first = rooms[0]
+def together(rooms: Mapping[str, Reading]) -> Reading:
+    """Return a reading without objects, with the notes on all rooms of a home, by their id."""
+    first = next(iter(rooms.values()))
     whole = Reading(replace(first.scene, objects=()), first.unknown, [], first.vocabulary)
-    for room in rooms:
+    for name, room in rooms.items():
         whole.warnings += [one for one in room.warnings if one not in whole.warnings]
-        whole.resolved += room.resolved
+        whole.resolved += [replace(one, room=name) for one in room.resolved]
     return whole
 
 
@@ -192,9 +202,13 @@ def _objects(
     for number, (name, entry) in enumerate(zip(ids, request.objects, strict=True)):
         at: Location = ("objects", number)
         label, at = (entry, at) if isinstance(entry, str) else (entry.label, (*at, "label"))
+        confidence = 1.0 if isinstance(entry, str) else entry.confidence
         if not isinstance(entry, str) and entry.alternatives:
             guess = read_guesses(entry, name, ("objects", number), unknown, errors)
-            label, index = (guess.labels[0], guess.classes[0]) if guess.classes else (label, None)
+            index = None
+            if guess.classes:
+                label, index = guess.labels[0], guess.classes[0]
+                confidence = min(1.0, guess.confidence[0])
             if len(guess.classes) > 1:
                 guesses[len(objects)] = guess
         else:
@@ -211,7 +225,8 @@ def _objects(
                 *_box(entry, conventions, _typical_size(unknown.vocabulary, index)),
                 *conventions.errors(entry.position_std, entry.size_std),
             )
-            objects.append(SceneObject(name, label, index, entry.confidence, *box))
+            confidence = max(confidence, _LEAST_CONFIDENCE)
+            objects.append(SceneObject(name, label, index, confidence, *box))
     return tuple(objects), detections
 
 
@@ -239,7 +254,7 @@ def _decide(
             yaw=yaw,
         )
         labels = [vocabulary.labels[guess.classes[k]] for k in order]
-        reading.resolved.append((thing.id, labels, p[order].tolist()))
+        reading.resolved.append(Decision(thing.id, labels, p[order].tolist()))
     reading.scene = replace(reading.scene, objects=tuple(objects))
 
 
@@ -279,6 +294,10 @@ def _check_fields(request: SceneRequest, limits: Limits, errors: ErrorList) -> N
     for name, most in (("objects", limits.objects), ("relations", limits.relations)):
         if len(getattr(request, name) or ()) > most:
             errors.add(InvalidRequestError, (name,), f"the scene must have at most {most} {name}")
+    several = [one for one in request.objects if not isinstance(one, str) and one.alternatives]
+    if sum(1 + len(one.alternatives) for one in several) > _MOST_LABELS:
+        message = f"objects with alternatives must have at most {_MOST_LABELS} labels together"
+        errors.add(InvalidRequestError, ("objects",), message)
     if request.relations is None and request.relations_complete:
         message = "`relations_complete` requires the field `relations`"
         errors.add(InvalidRequestError, ("relations_complete",), message)

@@ -50,7 +50,9 @@ def rooms(
     posterior, log_p = room_log_p(model, scene)
     sharpness = model.calibration.rooms.of(posterior.listed)
     if candidates is not None:
-        log_p = log_p - model.room_prior
+        is_plain = scene.profile is None
+        empty = model.room_prior if is_plain else model.empty_room_log_p(scene.profile)
+        log_p = log_p - empty
     p = softmax(sharpness * log_p[among])
     first = np.argsort(-p, kind="stable")[:top_k]
     entries: list[Fields] = []

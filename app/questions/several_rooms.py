@@ -10,12 +10,14 @@ repeat, with
 `gain` is the largest difference of both, with K from 2 to `MOST_ROOMS`. The search starts with each
 of the `_STARTS` best single types, and adds the best further type, one after another. A warning
 needs at least `LEAST_CLASSES` classes, and the gain `Calibration.several_rooms`. Few lists of one
-room reach it (`training.fit.calibrate_rooms`).
+room reach it (`training.fit.calibrate_rooms`). Weak detections do not count, and a request that
+states its room type gets no warning.
 
 The warning names the likeliest room of each object. With positions, straight lines divide the
 plane: each cut has the largest gain of log evidence, and at least `_LEAST_CUT`.
 """
 
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -24,7 +26,8 @@ from numpy.typing import NDArray
 
 from app.compiling import compiled
 from app.model.scene_model import SceneModel
-from app.scene.scene import Scene
+from app.questions.doubt import LEAST_REAL
+from app.scene.scene import Scene, SceneObject
 from scene_client.schemas import RoomPart, SceneWarning
 
 Floats = NDArray[np.floating[Any]]
@@ -39,17 +42,20 @@ _LEAST_PART: Final = 4  # objects of a part that is cut further
 _DIRECTIONS: Final = np.stack([np.cos(angle := np.arange(8) * np.pi / 8), np.sin(angle)])
 
 _MESSAGE: Final = (
-    "the objects are probably from {number} rooms ({names}), but the answers are about one room: "
-    "send one request for each room"
+    "the objects may be from {number} rooms ({names}), but the answers are about one room: send "
+    "one request for each room, or state the `room_type` of this room"
 )
 
 
 def several_rooms(model: SceneModel, scene: Scene) -> list[SceneWarning]:
     """Return the warning about a scene from several rooms, or no warning."""
     least, vocabulary = model.calibration.several_rooms, model.vocabulary
-    if least is None or model.spec.C < 2 or len(scene.objects) < LEAST_CLASSES:
+    if least is None or model.spec.C < 2 or scene.room_type is not None:
         return []
-    indices = [-1 if thing.class_index is None else thing.class_index for thing in scene.objects]
+    things = [one for one in scene.objects if one.confidence >= LEAST_REAL]
+    if len(things) < LEAST_CLASSES:
+        return []
+    indices = [-1 if thing.class_index is None else thing.class_index for thing in things]
     rows = vocabulary.stand_in[indices]
     listed = np.array(sorted({*rows.tolist()}))  # faster than `np.unique`
     listed = listed[~vocabulary.structure[listed]]
@@ -59,10 +65,10 @@ def several_rooms(model: SceneModel, scene: Scene) -> list[SceneWarning]:
     value, types = gain(evidence, model.room_odds, listed, least)
     if value < least:
         return []
-    ids = [thing.id for thing in scene.objects]
+    ids = [thing.id for thing in things]
     rooms = [
         RoomPart(vocabulary.room_types[t], [ids[k] for k in members])
-        for t, members in _parts(evidence, scene, rows, types).items()
+        for t, members in _parts(evidence, things, rows, types).items()
     ]
     if len(rooms) < 2:
         return []
@@ -127,19 +133,19 @@ def gain(
 
 def _parts(
     evidence: Float[Floats, "V C"],
-    scene: Scene,
+    things: Sequence[SceneObject],
     rows: Int[Indices, "N"],
     types: Int[Indices, "K"],
 ) -> dict[int, list[int]]:
     """Return the indices of the objects of each room type, in the order of the first object."""
     parts: dict[int, list[int]] = {}
-    if any(thing.position is None for thing in scene.objects):
+    if any(thing.position is None for thing in things):
         best = evidence[rows[:, None], types].argmax(1)
         for row, t in enumerate(types[best].tolist()):
             parts.setdefault(t, []).append(row)
         return parts
     r = evidence[rows]
-    points = np.array([thing.position[:2] for thing in scene.objects if thing.position])
+    points = np.array([thing.position[:2] for thing in things if thing.position])
     for members in _cut(r, points, np.arange(len(rows)), _MOST_CUTS):
         t = int(r[members].sum(0).argmax())
         parts[t] = sorted(parts.get(t, []) + members.tolist())

@@ -10,8 +10,9 @@ with the coefficients of `WhereFit`. Within the room, it is on, in or under an o
 probabilities of the placements of `/missing`, divided by their sum if this is above 1. The rest of
 the room has the rest of the probability. Several objects of a class share it equally.
 
-A listed thing of the class, or of a kind of it, is the wanted thing with its confidence. The hidden
-places share the probability that no listed thing is it.
+A listed thing of the class, or of a kind of it, is the wanted thing with the probability `real` of
+`app.questions.doubt`, at most `_MOST_CERTAIN`. A listed thing of a broader class counts with the
+share `_BROADER`. The hidden places share the probability that no listed thing is it.
 
 A place that the robot has searched without success keeps the share 1 - `LOOK`·s of its probability,
 where s is the share of the place that the robot has seen. Then all probabilities are divided by
@@ -19,7 +20,8 @@ their sum.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 from typing import Any, Final, NamedTuple
@@ -32,7 +34,7 @@ from app.errors import InvalidRequestError, Location
 from app.inference.elementary import softmax
 from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, named, rounded_number
-from app.questions.doubt import believed
+from app.questions.doubt import believed, doubt
 from app.questions.missing import VIEWER
 from app.questions.names import ErrorList, Unknown
 from app.questions.placements import every_placement
@@ -45,6 +47,11 @@ from scene_client.schemas import MAX_THINGS, HomeRoom, SceneRequest, WhereAnswer
 
 LOOK: Final = 0.8
 """Probability that a robot that sees the place of a thing detects the thing."""
+
+_MOST_CERTAIN: Final = 0.98  # probability of a listed thing, which may have been carried away
+_BROADER: Final = 0.5  # share of the listed chairs that count as the wanted office chair
+_LEAST_MISSED: Final = 1e-6
+_LEAST_SHOWN: Final = 1e-6  # least probability of a place in the answer
 
 NOWHERE: Final = -1
 """Index of the room of a thing that is in no room."""
@@ -100,10 +107,8 @@ def where(
         >>> where(model, rooms, model.vocabulary.index("toothbrush"))["rooms"][0]["room"]
         'bathroom'
     """
-    spots = [
-        spot._replace(weight=spot.weight * _missed(searched, spot))
-        for spot in _spots(model, rooms, wanted, axes, has_viewer=has_viewer)
-    ]
+    missed, found = _missed(searched), _spots(model, rooms, wanted, axes, has_viewer=has_viewer)
+    spots = [spot._replace(weight=spot.weight * missed(spot)) for spot in found]
     total = sum(spot.weight for spot in spots)
     share = np.zeros(len(rooms) + 1)  # of each room; the last one is `NOWHERE`
     for spot in spots:
@@ -128,31 +133,41 @@ def where(
     }
 
 
-def _missed(searched: Sequence[Search], spot: Spot) -> float:
-    """Return the probability that all searches have missed a thing at a place."""
-    return math.prod(
-        1.0 - LOOK * search.seen
-        for search in searched
-        if search.room == spot.room and search.thing in (None, spot.fields.get("object"))
-    )
+def _missed(searched: Sequence[Search]) -> Callable[[Spot], float]:
+    """Return the function of a place that gives the probability that all searches have missed it.
+
+    It is at least `_LEAST_MISSED`, so that many searches exclude nothing.
+    """
+    factors: dict[tuple[int, str | None], float] = defaultdict(lambda: 1.0)
+    for search in searched:
+        factors[search.room, search.thing] *= 1.0 - LOOK * search.seen
+
+    def of(spot: Spot) -> float:
+        factor = factors[spot.room, None]
+        if (thing := spot.fields.get("object")) is not None:
+            factor *= factors[spot.room, thing]
+        return max(factor, _LEAST_MISSED)
+
+    return of
 
 
 def _spots(
     model: SceneModel, rooms: Sequence[Room], wanted: int, axes: Axes, *, has_viewer: bool
 ) -> Iterator[Spot]:
     """Yield all places without searches, and that of no room. The weights have the sum 1."""
-    is_wanted = model.vocabulary.broader[:, wanted].copy()
-    is_wanted[wanted] = True
+    share = _shares_of_listed(model, wanted)
     others, listed = list[Scene](), list[Spot]()
     for row, room in enumerate(rooms):
         scene = room.scene
-        wanted_ones = [is_wanted[thing.class_index or 0] for thing in scene.objects]
-        for thing in compress(scene.objects, wanted_ones):
-            itself: Fields = {"object": thing.id, "is_listed": True}
-            listed.append(Spot(row, thing.confidence, itself))
-        if any(wanted_ones):
-            kept = [not is_one for is_one in wanted_ones]
-            objects = tuple(compress(scene.objects, kept))
+        classes = np.array([thing.class_index for thing in scene.objects], np.int64)
+        is_wanted = share[classes] > 0
+        if is_wanted.any():
+            posterior = Posterior(model, scene)
+            real = doubt(model, posterior, posterior.given_rest()[0]).real * share[classes]
+            for number in np.flatnonzero(is_wanted).tolist():
+                itself: Fields = {"object": scene.objects[number].id, "is_listed": True}
+                listed.append(Spot(row, min(float(real[number]), _MOST_CERTAIN), itself))
+            objects = tuple(compress(scene.objects, (~is_wanted).tolist()))
             scene = replace(scene, objects=objects, relations=None)
         others.append(scene)
     hidden = math.prod(1.0 - spot.weight for spot in listed)
@@ -175,6 +190,16 @@ def _spots(
             left -= p
             yield Spot(row, share * p, fields)
         yield Spot(row, share * max(left, 0.0), {})
+
+
+def _shares_of_listed(model: SceneModel, wanted: int) -> Float[NDArray[np.float64], "V"]:
+    """Return the share of the things of each class that are wanted: 1, `_BROADER` or 0."""
+    vocabulary = model.vocabulary
+    share = np.where(vocabulary.broader[wanted], _BROADER, 0.0)
+    share[vocabulary.broader[:, wanted]] = 1.0
+    share[wanted] = 1.0
+    share[vocabulary.structure] *= vocabulary.structure[wanted]
+    return share
 
 
 def room_log_odds(

@@ -292,3 +292,68 @@ assert not {"httpx", "training", "app"} & sys.modules.keys(), sys.modules.keys()
 def test_a_home_needs_no_numpy():
     environment = os.environ | {"PYTHONPATH": str(REPOSITORY / "clients" / "python")}
     run_program(sys.executable, "-c", WITHOUT_NUMPY, env=environment, cwd="/")
+
+
+@pytest.mark.parametrize("pose", [POSE, None])
+def test_two_frames_of_one_stamp_and_an_older_stamp(client, pose):
+    """Two cameras share a stamp, and a recording starts again."""
+    frame = KITCHEN if pose else ["stove", "fridge", "toilet"]
+    one = home(client) if pose else home(client, rooms=None)
+    for stamp in (1.0, 1.0, 2.0, 2.0, 0.0, 0.0, 1.0, 2.0, 3.0):
+        one.update(frame[:2], pose, stamp, room="kitchen")
+        one.update(frame[2:], pose, stamp, room="kitchen")
+    assert {track.label for track in one.things()} == {"stove", "fridge", "toilet"}
+
+
+def test_a_room_of_unknown_things_is_an_answer(client):
+    """The service refuses a scene without any known label. It is not lost."""
+    client.error = ProblemError("/problems/invalid-request", 422, "Invalid", "no known object")
+    one = home(client)
+    events = run(one, range(20), KITCHEN)
+    assert kinds(events, "service") == []
+    assert len(client.asked) <= 10
+    client.error, client.odd = None, {"toilet"}
+    assert kinds(run(one, range(20, 40), [*KITCHEN, thing("cup", 4.0)])) == ["out-of-place"]
+
+
+def test_a_pose_or_a_position_that_is_not_finite_is_none(client):
+    one = home(client)
+    lost = {"label": "cup", "confidence": 0.9, "position": [math.nan, 0.0, 1.0]}
+    events = run(one, range(5), [*KITCHEN, lost])
+    assert {e.label for e in events if e.kind == "appeared"} == {"stove", "fridge", "toilet"}
+    one.update(KITCHEN, (math.nan, 0.0, 0.0), 6.0)
+    one.update(KITCHEN, (0.0, 0.0, math.inf), 7.0)
+
+
+def test_a_long_room_name_is_no_room_type(client):
+    one = home(client, rooms=None)
+    run(one, range(5), KITCHEN, None, room="x" * 200)
+    assert all("room_type" not in fields for fields in client.questions("outliers"))
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"hit_rate": 1.0}, {"prior": 0.0}, {"hold": 0.0}, {"look": -1.0}, {"answers": 0}]
+)
+def test_wrong_settings_are_refused(wrong):
+    with pytest.raises(ValueError, match="must be"):
+        Settings(**wrong)
+
+
+def test_where_asks_about_the_fullest_rooms(client):
+    """At most 32 rooms, and an unnamed room has an id of its own."""
+    names = ["here", *(f"room {k}" for k in range(40))]
+    squares = [[(k, 0.0), (k + 0.9, 0.0), (k + 0.9, 1.0), (k, 1.0)] for k in range(41)]
+    one = home(client, rooms=dict(zip(names, squares, strict=True)))
+    run(one, range(5), [thing("cup", 40.5, 0.5)], (40.4, 0.1, 1.0))
+    one.where("cup")
+    (_, rooms, _) = client.asked[-1]
+    assert len(rooms) == 32
+    assert rooms[0]["id"] == "room 39"
+
+
+def test_tracks_follow_a_new_name_of_their_room(client, tmp_path):
+    with home(client, path=tmp_path / "home.json") as one:
+        run(one, range(5), KITCHEN)
+    renamed = {"cooking": ROOMS["kitchen"], "area 2": ROOMS["area 2"]}
+    again = home(client, rooms=renamed, path=tmp_path / "home.json")
+    assert {track.room for track in again.things()} == {"cooking"}

@@ -5,6 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from app import questions
+from app.errors import InvalidRequestError, UnknownLabelsError
 from app.model import LabelFit
 from app.questions.alternatives import Guesses, label_probabilities
 from app.questions.names import LookUps, Unknown
@@ -80,10 +82,11 @@ def labelled(label: str, confidence: float, *others: tuple[str, float], **fields
 
 def test_the_scene_has_the_likeliest_label():
     reading = read(["bed", labelled("lamp", 0.2, ("chair", 0.7), id="x")])
-    ((name, labels, p),) = reading.resolved
+    (decision,) = reading.resolved
+    labels, p = decision.labels, decision.probabilities
     thing = reading.scene.objects[1]
-    assert (name, set(labels), thing.label) == ("x", {"lamp", "chair"}, labels[0])
-    assert thing.class_index == LABELS.index(labels[0])
+    assert (decision.object, set(labels)) == ("x", {"lamp", "chair"})
+    assert (thing.label, thing.class_index) == (labels[0], LABELS.index(labels[0]))
     assert sum(p) == pytest.approx(1)
     assert p == sorted(p, reverse=True)
     assert thing.confidence == pytest.approx(0.9 * p[0])
@@ -110,8 +113,10 @@ def test_unknown_alternatives_are_left_out_and_an_unknown_label_is_replaced():
 
 def test_labels_of_one_class_count_together():
     reading = read(["bed", labelled("lamp", 0.3, ("Lamps", 0.3), ("chair", 0.35))])
-    ((_, labels, _),) = reading.resolved
-    assert sorted(labels) == ["chair", "lamp"]
+    (decision,) = reading.resolved
+    assert sorted(decision.labels) == ["chair", "lamp"]
+    reading = read(["bed", labelled("lamp", 0.3, ("Lamps", 0.3))])
+    assert reading.scene.objects[1].confidence == pytest.approx(0.6)
 
 
 def test_the_size_of_a_box_is_that_of_the_chosen_label():
@@ -123,3 +128,40 @@ def test_the_size_of_a_box_is_that_of_the_chosen_label():
     )  # fmt: skip
     assert reading.observed
     assert reading.scene.objects[1].position is not None
+
+
+def test_the_confidence_is_that_of_the_known_label():
+    reading = read(["bed", labelled("blurb", 0.9, ("lamp", 0.05))], unknown_labels="ignore")
+    assert reading.scene.objects[1].confidence == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("treatment", ["error", "nearest", "nearest-or-ignore"])
+def test_an_unknown_alternative_costs_no_answer(treatment):
+    reading = read(["bed", labelled("lamp", 0.6, ("xyzzy", 0.3))], unknown_labels=treatment)
+    assert reading.scene.objects[1].label == "lamp"
+
+
+def test_an_object_without_a_known_label_is_an_error():
+    with pytest.raises(UnknownLabelsError) as raised:
+        read(["bed", labelled("blurb", 0.6, ("xyzzy", 0.3))])
+    places = [one.location for one in raised.value.located]
+    assert places == [("objects", 1, "label"), ("objects", 1, "alternatives", 0, "label")]
+
+
+def test_too_many_labels_are_refused():
+    many = [labelled("lamp", 0.5, *[("chair", 0.1)] * 8) for _ in range(57)]
+    with pytest.raises(InvalidRequestError, match="errors"):
+        read(many)
+
+
+@pytest.mark.parametrize("confidence", [1e-320, 1e-46, 1e-10])
+def test_a_tiny_confidence_is_almost_no_object(artifact, confidence):
+    """float32 cannot divide by it."""
+    objects = ["bed", {"label": "lamp", "confidence": confidence}, "desk"]
+    request = MissingRequest.model_validate({"objects": objects})
+    reading = read_scene(request, artifact.vocabulary, Limits())
+    entries, without = (
+        questions.missing(artifact, scene, top_k=1)["missing"]
+        for scene in (reading.scene, scene_of([0, 2]))
+    )
+    assert entries[0]["probability"] == pytest.approx(without[0]["probability"], abs=1e-3)

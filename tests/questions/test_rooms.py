@@ -58,6 +58,13 @@ def test_probabilities_of_candidates_sum_to_one(artifact):
     assert rooms(artifact, scene_of(CLASSES), candidates={}) == ()
 
 
+@pytest.mark.parametrize("profile", [None, 1])
+def test_candidates_are_equally_likely_without_objects(artifact, profile):
+    profile = profile if artifact.spec.profiles else None
+    entries = rooms(artifact, scene_of([8], profile=profile), candidates={1: [], 0: []})
+    assert by_type(artifact, entries) == pytest.approx([0.5, 0.5], abs=1e-4)
+
+
 def test_reasons_are_changes_of_log_odds(artifact):
     """Each object is left out in turn. Structure is never a reason."""
     for entry in rooms(artifact, scene_of(CLASSES)):

@@ -79,3 +79,11 @@ def test_a_model_without_limit_or_room_types_gives_no_warning(model):
     everything = scene_of([0, 3, 1, 4, 2, 5])
     for artifact in (larger_artifact("triway-states"), larger_artifact("gbm", several_rooms=-1e9)):
         assert several_rooms(artifact, everything) == []
+
+
+def test_weak_detections_and_a_stated_type_give_no_warning(model):
+    scene = scene_of([0, 3, 1, 4, 2, 5, 5])
+    assert several_rooms(model, scene)
+    assert several_rooms(model, replace(scene, room_type=0)) == []
+    weak = [replace(one, confidence=0.3) if k % 2 else one for k, one in enumerate(scene.objects)]
+    assert several_rooms(model, replace(scene, objects=tuple(weak))) == []

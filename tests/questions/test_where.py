@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.model import WhereFit
+from app.model import RealFit, WhereFit
 from app.questions.where import LOOK, Room, Search, room_log_odds, where
 from tests.questions.answers import missing
 from tests.questions.artifacts import LABELS, LARGER, larger_artifact, scene_of
@@ -122,10 +122,37 @@ def test_a_listed_thing_is_the_thing_with_its_confidence(artifact):
     assert by_room(answer)["b"] == pytest.approx(0.3 * room, rel=1e-4)
 
 
-def test_a_certain_thing_leaves_nothing_elsewhere(artifact):
-    answer = where(artifact, [*HOME, Room("d", scene_of([THING]))], THING)
-    assert by_room(answer)["d"] == 1.0
-    assert answer["not_here"] == 0.0
+def test_a_listed_thing_may_have_been_carried_away(artifact):
+    """Searches without success move even a certain thing."""
+    home = [*HOME, Room("d", scene_of([THING]))]
+    answer = where(artifact, home, THING)
+    assert answer["places"][0]["probability"] == 0.98
+    for name, count in (("vase_0", 7), (None, 1024)):
+        answer = where(artifact, home, THING, searched=[Search(3, name, 1.0)] * count)
+        assert answer["places"][0]["room"] != "d"
+        assert total(where(artifact, home, THING, top_k=500)) == pytest.approx(1, abs=1e-4)
+
+
+def test_a_thing_of_a_broader_class_may_be_the_wanted_one():
+    artifact = larger_artifact("triway")
+    broader = np.zeros((9, 9), np.bool_)
+    broader[THING, 3] = True  # a chair may be a vase here
+    vars(artifact.vocabulary)["broader"] = broader
+    home = [*HOME[:1], Room("b", scene_of([6, 3]))]
+    first = where(artifact, home, THING)["places"][0]
+    assert (first["object"], first["is_listed"], first["probability"]) == ("chair_1", True, 0.5)
+    kinds = where(artifact, [*HOME[:1], Room("b", scene_of([6, THING]))], 3)["places"][0]
+    assert (kinds["object"], kinds["probability"]) == ("vase_1", 0.98)
+
+
+def test_a_wrong_detection_is_not_the_thing():
+    fit = RealFit(intercept=-9.0, confidence=1.0, context=0.0, log_count=0.0)
+    artifact = larger_artifact("triway", where=FIT, real=fit)
+    objects = scene_of([0, THING, 2]).objects
+    weak = replace(HOME[0].scene, objects=(objects[0], replace(objects[1], confidence=0.6)))
+    answer = where(artifact, [Room("a", weak), *HOME[1:]], THING, top_k=500)
+    listed = [one["probability"] for one in answer["places"] if one.get("is_listed")]
+    assert sum(listed) < 0.001
 
 
 def test_top_k_limits_the_places_but_not_the_rooms():

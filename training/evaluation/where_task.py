@@ -44,7 +44,7 @@ RIVALS: Final = ("first room, rooms alone", "first room, popularity")
 
 def where_task(model: SceneModel, setting: Setting) -> Outcome | None:
     """Measure the rooms and places of taken things; None without homes or room types."""
-    scenes = setting.some()
+    scenes = setting.scenes  # all of them, because a part of the scenes has parts of homes
     index = {(one.source, one.scene_id): k for k, one in enumerate(scenes.scenes)}
     structure = setting.structure.numpy()
     cases = home_cases(scenes.scenes, structure, setting.seed)

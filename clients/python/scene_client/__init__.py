@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from scene_client.files import from_file, rooms_from_file
     from scene_client.formats import from_data
     from scene_client.home import Home
+    from scene_client.home_settings import Settings
     from scene_client.home_state import Event
     from scene_client.offline import OfflineClient
     from scene_client.recorder import Recorder
     from scene_client.sync import Client
-    from scene_client.tracks import Settings
 
 __version__ = "2.0.0"
 
@@ -40,7 +40,7 @@ __all__ = [
 # the name. So the service, which needs only the schemas, starts without httpx.
 _MODULES = {
     "AsyncClient": "asynchronous", "Client": "sync", "Event": "home_state", "Home": "home",
-    "OfflineClient": "offline", "Recorder": "recorder", "Settings": "tracks",
+    "OfflineClient": "offline", "Recorder": "recorder", "Settings": "home_settings",
     "from_data": "formats", "from_file": "files", "rooms_from_file": "files",
 }  # fmt: skip
 

@@ -6,15 +6,16 @@ import atexit
 import logging
 import math
 import os
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from typing_extensions import Self
 
 from scene_client import schemas
-from scene_client.errors import ClientError, InvalidRequestError
+from scene_client.errors import ClientError, InvalidRequestError, ProblemError
+from scene_client.home_settings import Latch, Settings
 from scene_client.home_state import (
     MOST_THINGS,
     UNKNOWN,
@@ -23,15 +24,15 @@ from scene_client.home_state import (
     Room,
     State,
     inside,
+    pose_of,
     read_state,
+    seconds_of,
     write_state,
 )
 from scene_client.recorder import Recorder
 from scene_client.tracks import (
     Frame,
-    Latch,
     Point,
-    Settings,
     Track,
     Tracks,
     Vector,
@@ -117,24 +118,25 @@ class Home:
         `InvalidRequestError`.
         """
         seen = read_detections(detections)
-        if (now := _seconds(stamp)) < self._now:  # a recording starts again
-            self._saved = self._next = self._now = now
+        if (now := seconds_of(stamp)) < self._now:  # a recording starts again
+            self._saved = self._next = now
+            self._now = now - 1.0
         elapsed, self._now = now - self._now, now
         self._tracks.follow_jump(seen)
-        self._pose = None if pose is None else minus(_pose(pose), self._tracks.shift)
+        self._pose = None if (at := pose_of(pose)) is None else minus(at, self._tracks.shift)
         if room is None and self._pose is not None and self._polygons:
             room = self._room_of(self._pose, self.room) or self.room
         self.room = room or ""
         weight = min(1.0, elapsed / self.settings.look)
         self._rooms.setdefault(self.room, Room()).look(self._pose, weight)
-        frame = Frame(seen, now, weight, self._pose, view or self.view, self.room)
+        frame = Frame(seen, now, self._pose, view or self.view, self.room)
         tracks, appeared, gone = self._tracks.update(frame)
         self.matched = [one.id for one in tracks]
         events = [self._event("appeared", one, one.first) for one in appeared]
         events += [self._event("gone", one, one.last) for one in gone]
         events += self._ask()
         if self._lost is None:
-            events += [*self._alarms(tracks, elapsed), *self._settle(elapsed)]
+            events += [*self._alarms(tracks), *self._settle(elapsed)]
         if self.path is not None and now - self._saved >= self.settings.save_every:
             self._try_save()
         return events
@@ -149,10 +151,12 @@ class Home:
             return room
         return next((one for one, edge in self._polygons.items() if inside(x, y, edge)), "")
 
-    def _alarms(self, seen: Iterable[Track], elapsed: float) -> Iterator[Event]:
+    def _alarms(self, seen: Iterable[Track]) -> Iterator[Event]:
         """Count the verdicts about the seen things. Alarms of unseen things stay as they are."""
-        step = self._step(elapsed, self.settings.hold)
         for track in seen:
+            last, track.judged = track.judged, self._now
+            elapsed = 1.0 if last is None or last > self._now else self._now - last
+            step = self._step(elapsed, self.settings.hold)
             verdict, former = None if self._is_habit(track) else track.verdict, track.alarm.value
             if track.is_confirmed and track.alarm.update(verdict, self._now, step):
                 yield self._event(
@@ -199,6 +203,10 @@ class Home:
         except InvalidRequestError:
             raise
         except ClientError as error:
+            if isinstance(error, ProblemError) and error.status == HTTPStatus.UNPROCESSABLE_ENTITY:
+                self._remember(things)  # the service knows none of the labels
+                self._next = self._now + FIRST_PAUSE
+                return
             if self._lost is None:
                 yield Event("service", self._now, self._now, label="lost", detail=str(error))
             pause = FIRST_PAUSE if self._lost is None else min(LONGEST_PAUSE, 2 * self._lost)
@@ -220,6 +228,12 @@ class Home:
                 return True
         return False
 
+    def _remember(self, things: list[Track]) -> None:
+        """Remember what a question was about. The verdicts of its answer follow."""
+        self._asked[self.room] = {one.id: (one.label, one.confidence, one.place) for one in things}
+        for one in things:
+            one.verdict = None
+
     def _ask_type(self, room: Room, things: list[Track], timeout: float) -> None:
         objects = [one.as_object(self._tracks.shift) for one in things]
         fields: Any = {"candidates": self._candidates} if self._candidates else {}
@@ -238,12 +252,12 @@ class Home:
         if "room_type" in scene and room.is_named is None:
             guessed = [one.label for one in answer.mapped if one.similarity < 1]
             room.is_named = self.room not in (*answer.ignored, *guessed)
-        self._asked[self.room] = {one.id: (one.label, one.confidence, one.place) for one in things}
+        self._remember(things)
         moved = {one.moved or one.subject: one for one in answer.misplaced if one.is_misplaced}
         for one in answer.outliers:
             if (track := self._tracks.all.get(one.object)) is None:
                 continue
-            track.verdict, track.probability = None, one.probability
+            track.probability = one.probability
             if one.is_outlier:
                 track.verdict = "out-of-place"
             elif one.object in moved:
@@ -287,7 +301,8 @@ class Home:
             scene["frame_id"] = "map"
             if self._pose is not None:
                 scene["viewpoint"] = self._viewpoint(self._pose)
-        if room and self._rooms.get(room, Room()).is_named is not False:
+        is_word = 0 < len(room.strip()) <= schemas.MAX_LABEL and room.isprintable()
+        if is_word and self._rooms.get(room, Room()).is_named is not False:
             scene["room_type"] = room
         return scene
 
@@ -366,6 +381,8 @@ class Home:
         self._tracks.shift, self._tracks.count = state.shift, state.count
         self._rooms |= state.rooms
         for track in state.tracks.values():
+            if self._polygons and track.place is not None and track.room not in self._polygons:
+                track.room = self._room_of(track.place, "")  # its room has another name now
             self._tracks.add(track)
         self._now = self._saved = -math.inf if state.stamp is None else state.stamp
 
@@ -387,17 +404,3 @@ class Home:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _pose(values: Sequence[float] | Mapping[str, float]) -> Vector:
-    x, y, yaw = [values[n] for n in ("x", "y", "yaw")] if isinstance(values, Mapping) else values
-    return float(x), float(y), float(yaw)
-
-
-def _seconds(stamp: float | schemas.Stamp | schemas.Body | None) -> float:
-    if stamp is None:
-        return time.time()
-    if isinstance(stamp, int | float):
-        return float(stamp)
-    whole = schemas.Stamp.model_validate(stamp, from_attributes=True)
-    return whole.sec + whole.nanosec * 1e-9

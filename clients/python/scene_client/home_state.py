@@ -5,20 +5,23 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterable
+import time
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
 
 from pydantic import TypeAdapter
 
+from scene_client import schemas
 from scene_client.errors import HomeFileError
-from scene_client.tracks import Latch, Point, Track, Vector
+from scene_client.home_settings import Latch
+from scene_client.tracks import Point, Track, Vector
 
 FORMAT: Final = "scene-home"
 VERSION: Final = 1  # of the file
 UNKNOWN: Final = "nearest-or-ignore"  # treatment of unknown labels
-MOST_THINGS: Final = 256  # of a room in a request
+MOST_THINGS, MOST_ROOMS = 256, schemas.MAX_ROOMS  # of a room in a request, and of a home
 HEADINGS, LOOKS = 8, 30  # directions, or looks without poses, that show a whole room
 
 Kind = Literal[
@@ -68,6 +71,24 @@ class Room:
         return name if self.is_named else self.type.value
 
 
+def pose_of(values: Sequence[float] | Mapping[str, float] | None) -> Vector | None:
+    """Return x, y and yaw; None if the robot is not located."""
+    if values is None:
+        return None
+    x, y, yaw = [values[n] for n in ("x", "y", "yaw")] if isinstance(values, Mapping) else values
+    return (float(x), float(y), float(yaw)) if all(map(math.isfinite, (x, y, yaw))) else None
+
+
+def seconds_of(stamp: float | schemas.Stamp | schemas.Body | None) -> float:
+    """Return a stamp in seconds, by default the time of the computer's clock."""
+    if stamp is None:
+        return time.time()
+    if isinstance(stamp, int | float):
+        return float(stamp)
+    whole = schemas.Stamp.model_validate(stamp, from_attributes=True)
+    return whole.sec + whole.nanosec * 1e-9
+
+
 def inside(x: float, y: float, polygon: Iterable[Point]) -> bool:
     """Return whether a polygon contains a point (even-odd rule)."""
     corners, odd = list(polygon), False
@@ -94,13 +115,19 @@ class State:
     def where_fields(self) -> dict[str, Any]:
         """Return the fields of a `where` request about the present things, without a label."""
         fields: dict[str, Any] = {"rooms": [], "unknown_labels": UNKNOWN}
-        for name, known in self.rooms.items():
-            present = [one for one in self.tracks.values() if one.is_confirmed and one.room == name]
-            if not present and not name:
-                continue
-            present.sort(key=lambda one: -one.confidence)
-            objects = [one.as_object(self.shift) for one in present[:MOST_THINGS]]
-            room = {"id": name or "here", "objects": objects, "coverage": known.coverage}
+        things: dict[str, list[Track]] = {name: [] for name in self.rooms if name}
+        for track in sorted(self.tracks.values(), key=lambda one: -one.confidence):
+            if track.is_confirmed:
+                things.setdefault(track.room, []).append(track)
+        names = sorted(things, key=lambda name: -len(things[name]))[:MOST_ROOMS]
+        left = schemas.MAX_THINGS
+        for name in names:
+            present = things[name][: min(MOST_THINGS, left)]
+            left -= len(present)
+            objects = [one.as_object(self.shift) for one in present]
+            known = self.rooms.get(name, Room())
+            here = "here" if "here" not in things else "elsewhere"
+            room = {"id": name or here, "objects": objects, "coverage": known.coverage}
             if (kind := known.settled_type(name)) is not None:
                 room["room_type"] = kind
             fields["rooms"].append(room)

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final
 
 from scene_client import schemas
 from scene_client.calls import validated
+from scene_client.home_settings import Latch, Settings
 
 Vector = tuple[float, float, float]
 Point = tuple[float, float]
@@ -30,53 +31,6 @@ BESIDE: Final = math.radians(45)  # between a thing and its neighbours in a fram
 FULL, POSES, LABELS = 1.0, 0.6, 0.25
 
 
-@dataclass(frozen=True)
-class Settings:
-    """The settings of a `Home`. The defaults are those of the best patrols (docs/moving.md)."""
-
-    hit_rate: float = 0.7  # probability that the detector reports a thing that the frame shows
-    false_rate: float = 0.02  # probability of a wrong detection at the place of an absent thing
-    prior: float = 0.1  # probability that the first detection at a place shows a thing
-    confirm: float = 0.9  # probability of existence from which a thing is present
-    gate: float = 0.3  # metres between detections of one small thing; more for a large thing
-    look: float = 0.5  # seconds between independent looks; faster frames count in proportion
-    hold: float = 3.0  # seconds in view until an alarm is raised or cleared
-    answers: int = 3  # looks until an alarm is raised or cleared
-    room_hold: float = 5.0  # seconds until the type of a room is settled, or changes
-    pause: float = 0.5  # seconds between questions
-    step: float = 0.1  # change of a probability, or metres of a position, that needs an answer
-    sensitivity: schemas.Sensitivity = "medium"  # rate of alarms of the service
-    timeout: float = 1.0  # maximum seconds of a question
-    save_every: float = 10.0  # seconds between writes of the file
-
-
-@dataclass
-class Latch:
-    """A value that changes only after a while.
-
-    The steps for a candidate must be ahead of all other steps by 1 (majority vote of Boyer and
-    Moore). `since` is the time of the candidate's first step.
-    """
-
-    value: str | None = None
-    candidate: str | None = None
-    level: float = 0.0
-    since: float = 0.0
-
-    def update(self, value: str | None, now: float, step: float) -> bool:
-        """Count one step for a value. Return whether the latch changes to this value."""
-        if value == self.value or (value != self.candidate and self.level > step / 2):
-            self.level = max(0.0, self.level - step)
-            return False
-        if value != self.candidate or self.level == 0:
-            self.candidate, self.level, self.since = value, 0.0, now
-        self.level += step
-        if self.level < 1 - 1e-9:
-            return False
-        self.value, self.candidate, self.level = value, None, 0.0
-        return True
-
-
 @dataclass
 class Seen:
     """One detection: the confidence of each label, and its box."""
@@ -88,9 +42,20 @@ class Seen:
 
 
 def read_detections(detections: Iterable[Any]) -> list[Seen]:
-    """Return the detections of a frame, or raise an `InvalidRequestError`."""
-    request = validated(schemas.SceneRequest, {"objects": list(detections)})
+    """Return the detections of a frame, or raise an `InvalidRequestError`.
+
+    Detections whose position is not finite are left out: the camera had no depth there.
+    """
+    located = [one for one in detections if _is_located(one)]
+    request = validated(schemas.SceneRequest, {"objects": located})
     return [Seen({one: 1.0}) if isinstance(one, str) else _seen(one) for one in request.objects]
+
+
+def _is_located(detection: Any) -> bool:
+    """Return whether the position of a detection has no NaN and no infinity."""
+    at = detection.get("position") if isinstance(detection, Mapping) else None
+    values = at.values() if isinstance(at, Mapping) else at if isinstance(at, list | tuple) else ()
+    return all(math.isfinite(one) for one in values if isinstance(one, int | float))
 
 
 def _seen(one: schemas.Detection) -> Seen:
@@ -116,6 +81,8 @@ class Track:
     place: Vector | None = None  # running mean, like the size
     size: Vector | None = None
     yaw: float | None = None
+    looked: float | None = None  # time of the last look, with or without a detection
+    judged: float | None = None  # time of the last step of the alarm
     looks: float = 0.0  # number of looks with a detection
     missed: float = 0.0  # number of looks without one, since the last detection
     is_confirmed: bool = False
@@ -180,7 +147,6 @@ class Frame:
 
     seen: list[Seen]
     now: float
-    weight: float  # number of independent looks, 0 to 1
     pose: Vector | None  # x, y and yaw of the robot
     view: Point | None  # full horizontal angle of the camera, and its reach
     room: str  # room of the robot
@@ -250,16 +216,18 @@ class Tracks:
 
         Existence is a log-odds filter. With the probability v that the frame shows the thing, the
         hit rate h and the false rate f, a hit of confidence c adds c ln(v h / f), and a miss adds
-        ln((1 - v h) / (1 - f)), each times the number of looks.
+        ln((1 - v h) / (1 - f)), each times the number of looks since the last one, at most 1.
         """
         s, seen = self.settings, self._associate(frame)
         for track, one in zip(seen, frame.seen, strict=True):
             chance = LABELS if one.place is None else FULL
             hit = min(1.0, sum(one.labels.values())) * math.log(chance * s.hit_rate / s.false_rate)
-            track.log_odds = min(MOST_CERTAIN, track.log_odds + frame.weight * hit)
+            weight = _new_looks(track.last if track.looks else None, frame.now, s.look)
+            track.looked = frame.now
+            track.log_odds = min(MOST_CERTAIN, track.log_odds + weight * hit)
             if track.place is not None:
                 del self._cells[_cell(track.place)][track.id]
-            track.see(one, frame.now, frame.weight)
+            track.see(one, frame.now, weight)
             if track.place is not None:
                 self._cells[_cell(track.place)][track.id] = track
                 track.room = self.room_of(track.place, track.room)
@@ -267,8 +235,10 @@ class Tracks:
         for track in [one for one in self.all.values() if one.id not in hits]:
             if chance := frame.chance(track):
                 miss = math.log((1 - chance * s.hit_rate) / (1 - s.false_rate))
-                track.log_odds += frame.weight * miss
-                track.missed += frame.weight
+                weight = _new_looks(track.looked, frame.now, s.look)
+                track.looked = frame.now
+                track.log_odds += weight * miss
+                track.missed += weight
             is_stale = not track.is_confirmed and frame.now - track.last > UNCONFIRMED
             if track.log_odds < math.log(s.false_rate) or is_stale:
                 self.remove(track)
@@ -382,6 +352,11 @@ def plus(a: Vector, b: Vector) -> Vector:
 def minus(a: Vector, b: Vector) -> Vector:
     """Return the difference of two vectors."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+def _new_looks(last: float | None, now: float, look: float) -> float:
+    """Return the number of independent looks since the last one, at most 1."""
+    return 1.0 if last is None or now < last else min(1.0, (now - last) / look)
 
 
 def _cell(place: Vector) -> tuple[int, int]:

@@ -159,6 +159,8 @@ class Resolved(Reply):
     """
 
     object: str
+    room: str | None = None
+    """id of the room of the object, in an answer of `/where`"""
     labels: list[LabelProbability]
     """known labels of the object, likeliest first. The probabilities sum to 1"""
 
