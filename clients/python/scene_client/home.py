@@ -263,7 +263,7 @@ class Home:
             elif one.object in moved:
                 track.verdict, track.probability = "misplaced", moved[one.object].probability
             elif one.reason == "misdetection":
-                track.verdict, track.probability = "misdetection", 1 - one.real
+                track.verdict, track.probability = "misdetection", 1 - (one.real or 0.0)
 
     @property
     def alarms(self) -> list[Event]:

@@ -101,7 +101,7 @@ def outliers(answer: schemas.OutliersAnswer) -> RenderableType:
         (
             *(entry.object, _class(entry), f"{entry.probability:.3f}"),
             "" if entry.log_odds is None else f"{entry.log_odds:+.2f}",
-            f"{entry.real:.3f}" if "real" in entry.model_fields_set else "",
+            "" if entry.real is None else f"{entry.real:.3f}",
             "outlier" if entry.is_outlier else entry.reason or "",
             _reasons(entry.because),
             ", ".join(entry.usually_with),

@@ -53,7 +53,7 @@ class Outlier(Reply):
     probability: Probability
     log_odds: Finite | None = None
     """absent for an object of probability 0, which is not judged"""
-    real: Probability = 1.0
+    real: Probability | None = None
     """absent if all objects have confidence 1, which counts as certain. A weak detection that does
     not fit is probably wrong"""
     is_outlier: bool
