@@ -305,7 +305,8 @@ async def test_candidates_of_one_room_type_share_its_probability(client: AsyncCl
         "bedroom": None,
         "office": ["study"],
     }
-    every = await ask(client, "rooms", objects=["bed", "lamp"])
+    once = ["bathroom", "bedroom", "office"]
+    every = await ask(client, "rooms", objects=["bed", "lamp"], candidates=once)
     p = {one["room_type"]: one["probability"] for one in every["room_types"]}
     assert {name: one.probability for name, one in found.items()} == p
     assert sum(p.values()) == pytest.approx(1, abs=1e-3)
