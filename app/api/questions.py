@@ -193,7 +193,8 @@ Such a question takes about 2 ms.
 def is_quick(request: SceneRequest | WhereRequest, vocabulary: Vocabulary) -> bool:
     """Return whether the event loop may compute a question about a scene or a home."""
     objects = objects_of(request)
-    several = sum(len(one.alternatives) for one in objects if not isinstance(one, str))
+    details = [one for one in objects if not isinstance(one, str)]
+    several = sum(len(one.alternatives) for one in details)
     is_little = len(objects) <= QUICK_OBJECTS and several <= QUICK_OBJECTS
     if isinstance(request, WhereRequest):
         is_little &= len(request.rooms) <= QUICK_ROOMS

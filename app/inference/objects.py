@@ -30,7 +30,16 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled, compiled_in_any_order
-from app.inference.elementary import LN2, exp, exponent, log, log_softmax, mantissa, sigmoid
+from app.inference.elementary import (
+    LN2,
+    exp,
+    exponent,
+    log,
+    log_softmax,
+    mantissa,
+    sigmoid,
+    softmax,
+)
 from app.inference.relation_units import EncodedScene
 from app.inference.weights import LISTED_SHARES, Weights, all_states
 
@@ -268,7 +277,7 @@ class ObjectScorer:
         logits = weights["e"] + self.room_evidence(x, classes, presence)
         if not weights.spec.profiles:
             return log_softmax(logits)
-        by_source = np.exp(log_softmax(logits[:, None] + weights["y"]))
+        by_source = softmax(logits[:, None] + weights["y"])
         p = weights.source_weights(classes, presence, profile)[:, None] @ by_source
         return np.log(np.maximum(p[:, 0], _SMALLEST))
 

@@ -4,10 +4,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from app.inference import MachineSpec, Weights
@@ -36,6 +36,15 @@ _HIGHEST_SEAT: Final = 0.8  # maximum height of a seat, as a share of the height
 # Maximum median spread of the heights of things, as a share of the height of the furniture. Things
 # in furniture with several shelves have a larger spread.
 _SEAT_SPREAD: Final = 0.28
+
+
+class RoomEvidence(NamedTuple):
+    """The evidence of V classes for C room types; see `app.questions.several_rooms`."""
+
+    log: Float[NDArray[np.float32], "V C"]
+    odds: Float[NDArray[np.float32], "V C"]  # e^log
+    top: Float[NDArray[np.float32], "V"]  # largest `log` of each class
+    row: Int[NDArray[np.int64], "N"]  # of each class of the vocabulary; -1: structure
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,26 +130,17 @@ class SceneModel:
         return self.objects.room_log_p(c1[None], nothing, np.zeros((1, 0), np.float32), profile)[0]
 
     @cached_property
-    def room_evidence(self) -> Float[NDArray[np.float32], "V C"]:
-        """Evidence of each class for each room type: `ROOM_SHARPNESS` (log p(t | i) - log p(t)).
-
-        p(t | i) is the probability of room type t given a scene of class i alone.
-        """
-        if not self.spec.C:
-            return np.zeros((self.spec.V, 0), np.float32)
+    def room_evidence(self) -> RoomEvidence:
+        """The evidence of each class for each room type; see `app.questions.several_rooms`."""
         V, one = self.spec.V, np.ones((1, 1), np.float32)
         c1, W, objects = self.weights["c1"], self.weights["W"], self.objects
         alone = [
             objects.room_log_p((c1 + W[i])[None], np.array([i]), one, None)[0] for i in range(V)
         ]
-        evidence = ROOM_SHARPNESS * (np.stack(alone) - self.room_prior)
-        evidence[self.vocabulary.structure] = 0.0
-        return evidence.astype(np.float32)
-
-    @cached_property
-    def room_odds(self) -> Float[NDArray[np.float32], "V C"]:
-        """The exponential of `room_evidence`."""
-        return np.exp(self.room_evidence)
+        log = (ROOM_SHARPNESS * (np.stack(alone) - self.room_prior)).astype(np.float32)
+        log[self.vocabulary.structure] = 0.0
+        row = np.where(self.vocabulary.structure, -1, np.arange(V))
+        return RoomEvidence(log, np.exp(log), log.max(1), row)
 
     @cached_property
     def rarely_shown(self) -> Bool[NDArray[np.bool_], "V"]:
@@ -206,8 +206,9 @@ class SceneModel:
             )
             # A reference to this model would close a cycle; see `app.serving.runtime`.
             stand_in = kept.vocabulary.stand_in
-            vars(kept)["room_evidence"] = self.room_evidence
-            vars(kept)["room_odds"] = self.room_odds
+            if self.spec.C:
+                row = self.room_evidence.row[stand_in]
+                vars(kept)["room_evidence"] = self.room_evidence._replace(row=row)
             vars(kept)["relation_units"] = StandIns(kept.weights, self.relation_units, stand_in)
             if len(self._with_words) >= _MOST_KEPT:
                 self._with_words.clear()  # in one step, because other threads read it

@@ -13,7 +13,7 @@ and with s_i. A detection of confidence 1 is real.
 
 A probable intruder and a probably wrong detection say little about the scene. So other answers
 weight the presence of an object of class i by real · (1 - sigmoid(l_i)) (`believed`). The room type
-has a mixture over the hypotheses that nothing, or one class k, is an intruder (`room_log_p`):
+has a mixture over the hypotheses that nothing, or one class k, is an intruder (`room_odds`):
 
     p(t) = (p(t | v) + sum_k w_k p(t | v without k)) / (1 + sum_k w_k),   w_k = exp(l_k) (e n / N)²
 
@@ -38,7 +38,7 @@ from app.compiling import compiled
 from app.inference.elementary import sigmoid
 from app.model.calibration import RealFit
 from app.model.scene_model import SceneModel
-from app.questions.posterior import Posterior
+from app.questions.posterior import Posterior, log_odds_of
 from app.scene.scene import Scene, pool_classes
 
 HYPOTHESES: Final = 4
@@ -60,6 +60,7 @@ class Doubt(NamedTuple):
     real: Float[Floats, "N"]  # probability that each object is a right detection
     exists: Float[Floats, "n"]  # presence of each class, weighted by `real`
     presence: Float[Floats, "n"]  # presence of each class, weighted by all doubt
+    is_unsure: bool  # whether a `real` is below 1
 
 
 def doubt(model: SceneModel, posterior: Posterior, log_odds: Float[Floats, "n"]) -> Doubt:
@@ -78,11 +79,11 @@ def doubt(model: SceneModel, posterior: Posterior, log_odds: Float[Floats, "n"])
     )
     real: Float[Floats, "N"] = present.confidence
     exists: Float[Floats, "n"] = present.presence
-    if model.calibration.real is not None and real.min() < 1.0:
+    if (is_unsure := bool(real.min() < 1.0)) and model.calibration.real is not None:
         real = _real(model.calibration.real, real, score[present.row], n)
         exists = pool_classes(present.classes[present.row], real)[4].astype(np.float32)
         presence *= exists / present.presence
-    return Doubt(logits, p, real, exists, presence)
+    return Doubt(logits, p, real, exists, presence, is_unsure)
 
 
 @compiled
@@ -142,24 +143,37 @@ def believed(model: SceneModel, scene: Scene) -> Posterior:
     return posterior
 
 
-def room_log_p(
-    model: SceneModel, scene: Scene
-) -> tuple[Posterior, Float[NDArray[np.float64], "C"]]:
-    """Return the posterior without the room type of a scene, and log p(t) of each room type t.
+class RoomOdds(NamedTuple):
+    """The probabilities of the C room types of a scene with n classes."""
 
-    Only `real` weights the posterior. The mixture over intruders is in log p(t).
-    """
+    posterior: Posterior  # without the room type of the scene; only `real` weights it
+    log_p: Float[NDArray[np.float64], "C"]  # of each room type, with the mixture over intruders
+    # Log-odds of each room type minus its log-odds without each class, without the mixture; None:
+    # not wanted.
+    change: Float[NDArray[np.float64], "C n"] | None
+
+
+def room_odds(model: SceneModel, scene: Scene, *, explained: bool = False) -> RoomOdds:
+    """Return the probabilities of room types; `explained` asks for the changes by each class."""
     posterior = Posterior(model, replace(scene, room_type=None))
     if not scene.objects:
-        return posterior, posterior.room_log_p()
+        nothing = np.zeros((model.spec.C, 0)) if explained else None
+        return RoomOdds(posterior, posterior.room_log_p()[0], nothing)
     about = doubt(model, posterior, posterior.given_rest()[0])
     posterior.weight(about.exists)
-    log_p = posterior.room_log_p()
     chosen = np.argsort(-about.logits, kind="stable")[:HYPOTHESES]
     prior = 2.0 + 2.0 * math.log(min(max(posterior.listed, 1), LONG_LIST) / LONG_LIST)
     weights = np.exp(np.minimum(about.logits[chosen] + prior, _LARGEST))
     total = float(weights.sum())
-    if posterior.listed < 2 or total < _LEAST_WEIGHT:
-        return posterior, log_p
-    mixture = np.exp(log_p) + weights @ np.exp(posterior.room_log_p_without(chosen))
-    return posterior, np.log(np.maximum(mixture / (1.0 + total), _SMALLEST))
+    has_mixture = posterior.listed > 1 and total >= _LEAST_WEIGHT
+    if not has_mixture:
+        chosen = chosen[:0]
+    table = posterior.room_log_p(np.arange(len(about.logits)) if explained else chosen)
+    log_p, without, change = table[0], table[1:], None
+    if explained:
+        change = (log_odds_of(log_p) - log_odds_of(without)).T
+        without = without[chosen]
+    if has_mixture:
+        mixture = np.exp(log_p) + weights @ np.exp(without)
+        log_p = np.log(np.maximum(mixture / (1.0 + total), _SMALLEST))
+    return RoomOdds(posterior, log_p, change)

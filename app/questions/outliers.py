@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
+from app.compiling import compiled
 from app.model.calibration import Sensitivity
 from app.model.scene_model import SceneModel
 from app.questions.answer import EXPLAINED, Fields, best, reasons, rounded_number, significant
@@ -34,6 +35,7 @@ Floats = NDArray[np.floating[Any]]
 COMPANIONS: Final = 3  # maximum number of companions in the answer for one outlier
 
 _LEAST_SHARE: Final = 0.5  # smallest increase of a companion, as a share of the largest
+_LEAST_INCREASE: Final = 1e-6
 
 
 def outliers(
@@ -114,7 +116,7 @@ def _judged(
     """
     present, vocabulary = posterior.present, model.vocabulary
     labels, broader = vocabulary.labels, vocabulary.broader_labels
-    logits, p, real, _, presence = about
+    logits, p, presence = about.logits, about.p, about.presence
     reaches = (p >= threshold) & (posterior.listed > 1)
     may_alarm = reaches & can_alarm[present.classes]
     # The order follows the logits, because probabilities near 0 or 1 may round to the same number.
@@ -134,9 +136,8 @@ def _judged(
             if flags[row]:
                 companions[row] = _companions(model, present.classes, classes[row])
     judged: list[Fields] = []
-    numbers, unsure = order.tolist(), bool((real < 1.0).any())
-    certainty = significant(real[order]) if unsure else [1.0] * len(rows)
-    for number, row, certain in zip(numbers, rows, certainty, strict=True):
+    certainty = significant(about.real[order]) if about.is_unsure else [1.0] * len(rows)
+    for number, row, certain in zip(order.tolist(), rows, certainty, strict=True):
         thing = scene.objects[number]
         fields: Fields = {"object": thing.id, "label": labels[classes[row]]}
         if thing.label != fields["label"]:
@@ -146,7 +147,7 @@ def _judged(
         fields["probability"] = probabilities[row]
         if probabilities[row]:
             fields["log_odds"] = values[row]
-        if unsure:
+        if about.is_unsure:
             fields["real"] = certain
         is_outlier = fields["is_outlier"] = flags[row] and certain >= LEAST_REAL
         if is_outlier or certain < LEAST_REAL:
@@ -190,12 +191,28 @@ def intruders(model: SceneModel, scene: Scene) -> NDArray[np.int64]:
 
 def _companions(model: SceneModel, present: Int[NDArray[np.int64], "n"], flagged: int) -> list[str]:
     """Return the labels of the companions of an outlier, best first; see the module."""
-    usable = ~model.vocabulary.structure
-    usable[present] = False
     increase, rank = model.objects.increases(flagged)
-    least = max(_LEAST_SHARE * float(increase[usable].max(initial=0)), 1e-6)
-    chosen = best(rank, usable & (increase >= least) & (rank > 0), COMPANIONS)
+    chosen = _typical(increase, rank, model.vocabulary.structure, present)
     return [model.vocabulary.labels[index] for index in chosen.tolist()]
+
+
+@compiled
+def _typical(
+    increase: Float[NDArray, " V"],
+    rank: Float[NDArray, " V"],
+    structure: Bool[NDArray, " V"],
+    present: Int[NDArray, " n"],
+) -> Int[NDArray, " k"]:
+    """Return the companions of a class: `ObjectScorer.increases` gives increase and rank."""
+    usable, largest = ~structure, np.float32(0.0)
+    usable[present] = False
+    for j in range(len(usable)):
+        if usable[j]:
+            largest = max(largest, increase[j])
+    least = max(_LEAST_SHARE * largest, _LEAST_INCREASE)
+    for j in range(len(usable)):
+        usable[j] &= increase[j] >= least and rank[j] > 0
+    return best(rank, usable, COMPANIONS)
 
 
 def _too_rare(model: SceneModel, objects: list[SceneObject]) -> list[SceneWarning]:

@@ -33,6 +33,8 @@ Singles = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
+_NO_ROWS: Final = np.zeros(0, np.int64)
+
 LEAST_CHANGE: Final = math.log(3)
 """Minimum change of log-odds by a reason: substantial evidence is a Bayes factor of at least 3."""
 
@@ -132,25 +134,16 @@ class Posterior:
             self.context, self._profile, self._room, explained=explained
         )
 
-    def room_log_p(self) -> Float[Doubles, "C"]:
-        """Return log p(t | objects) of each room type t in a scene of unknown room type."""
-        return self._room_log_p(self.context.x[None], self.present.presence[None])[0]
+    def room_log_p(self, without: Int[Indices, "m"] = _NO_ROWS) -> Float[Doubles, "1+m C"]:
+        """Return log p(t | objects) of each room type t in a scene of unknown room type.
 
-    def _room_log_p(
-        self, x: Float[Floats, "B H1"], presence: Float[Floats, "B n"]
-    ) -> Float[Doubles, "B C"]:
+        The first row is for all objects. The others leave out the class of a row of `present` each.
+        """
+        x = np.repeat(self.context.x[None], 1 + len(without), axis=0)
+        x[1:] -= self.context.contributions[without]
+        presence = np.repeat(self.present.presence[None], len(x), axis=0)
+        presence[np.arange(1, len(x)), without] = 0.0
         return self._objects.room_log_p(x, self.present.classes, presence, self._profile)
-
-    def room_log_p_without(self, rows: Int[Indices, "m"]) -> Float[Doubles, "m C"]:
-        """Return log p(t | objects) of each room type without the class in each of the rows."""
-        presence = np.tile(self.present.presence, (len(rows), 1))
-        presence[np.arange(len(rows)), rows] = 0.0
-        return self._room_log_p(self.context.x - self.context.contributions[rows], presence)
-
-    def room_reasons(self) -> Float[Doubles, "C n"]:
-        """Return the log-odds of each room type minus its log-odds without each class."""
-        without = self.room_log_p_without(np.arange(len(self.present.classes)))
-        return (log_odds_of(self.room_log_p()) - log_odds_of(without)).T
 
     def relation_log_odds(self) -> Float[Floats, "A n n"]:
         """Return the log-odds of every relation of the scene's classes, without its observation."""

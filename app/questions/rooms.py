@@ -14,7 +14,7 @@ import numpy as np
 from app.inference.elementary import softmax
 from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, reasons, significant
-from app.questions.doubt import room_log_p
+from app.questions.doubt import room_odds
 from app.questions.names import ErrorList
 from app.questions.posterior import LEAST_CHANGE
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
@@ -47,7 +47,7 @@ def rooms(
     among = np.arange(C) if candidates is None else np.array([*candidates], dtype=np.int64)
     if not len(among):
         return {"warnings": [] if C else [_NO_ROOM_TYPES], "room_types": []}
-    posterior, log_p = room_log_p(model, scene)
+    posterior, log_p, change = room_odds(model, scene, explained=details)
     sharpness = model.calibration.rooms.of(posterior.listed)
     if candidates is not None:
         is_plain = scene.profile is None
@@ -61,9 +61,9 @@ def rooms(
         entries.append({"room_type": name, "probability": probability})
         if candidates is not None and candidates[t] != [name]:
             entries[-1]["listed_as"] = candidates[t]
-    if details:
-        change = posterior.room_reasons()[among[first]]
-        causes = reasons(scene, posterior.present, change, least=LEAST_CHANGE)
+    if change is not None:
+        of_entries = change[among[first]]
+        causes = reasons(scene, posterior.present, of_entries, least=LEAST_CHANGE)
         for entry, because in zip(entries, causes, strict=True):
             entry["because"] = because
     return {"room_types": entries}

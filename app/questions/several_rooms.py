@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled
@@ -49,26 +49,19 @@ _MESSAGE: Final = (
 
 def several_rooms(model: SceneModel, scene: Scene) -> list[SceneWarning]:
     """Return the warning about a scene from several rooms, or no warning."""
-    least, vocabulary = model.calibration.several_rooms, model.vocabulary
+    least = model.calibration.several_rooms
     if least is None or model.spec.C < 2 or scene.room_type is not None:
         return []
-    things = [one for one in scene.objects if one.confidence >= LEAST_REAL]
-    if len(things) < LEAST_CLASSES:
+    classes = [one.class_index for one in scene.objects if one.confidence >= LEAST_REAL]
+    if len(classes) < LEAST_CLASSES:
         return []
-    indices = [-1 if thing.class_index is None else thing.class_index for thing in things]
-    rows = vocabulary.stand_in[indices]
-    listed = np.array(sorted({*rows.tolist()}))  # faster than `np.unique`
-    listed = listed[~vocabulary.structure[listed]]
-    evidence = model.room_evidence
-    if len(listed) < LEAST_CLASSES:
-        return []
-    value, types = gain(evidence, model.room_odds, listed, least)
+    value, types = gain(*model.room_evidence, np.array(classes), least)
     if value < least:
         return []
-    ids = [thing.id for thing in things]
+    things = [one for one in scene.objects if one.confidence >= LEAST_REAL]
     rooms = [
-        RoomPart(vocabulary.room_types[t], [ids[k] for k in members])
-        for t, members in _parts(evidence, things, rows, types).items()
+        RoomPart(model.vocabulary.room_types[t], [things[k].id for k in members])
+        for t, members in _parts(model, things, types).items()
     ]
     if len(rooms) < 2:
         return []
@@ -79,72 +72,74 @@ def several_rooms(model: SceneModel, scene: Scene) -> list[SceneWarning]:
 def warm_up(model: SceneModel) -> None:
     """Compute the evidence of a model, and compile the loop."""
     if model.spec.C:
-        gain(model.room_evidence, model.room_odds, np.zeros(1, np.int64), 0.0)
+        gain(*model.room_evidence, np.zeros(1, np.int64), 0.0)
 
 
 @compiled
 def gain(
-    evidence: Float32[NDArray, "V C"],
-    odds: Float32[NDArray, "V C"],  # e^evidence
-    listed: Int[NDArray, " n"],
+    log: Float[NDArray, "V C"],  # the fields of `RoomEvidence`
+    odds: Float[NDArray, "V C"],
+    top: Float[NDArray, " V"],
+    row: Int[NDArray, " W"],
+    classes: Int[NDArray, " N"],
     least: float,  # a smaller upper bound of the gain ends the search
 ) -> tuple[float, Int[NDArray, " K"]]:
     """Return the gain of several rooms over one, and their types; see the module.
 
-    The upper bound is the gain if each class had a room of its best type.
+    The gain of fewer than `LEAST_CLASSES` classes is -inf. The upper bound is the gain if each
+    class had a room of its best type.
     """
-    n, C = len(listed), evidence.shape[1]
+    C, is_listed = log.shape[1], np.zeros(len(log), np.bool_)
+    for i in classes:
+        is_listed[row[i]] |= row[i] >= 0
+    listed = np.flatnonzero(is_listed)
+    n, types = len(listed), np.zeros(MOST_ROOMS, np.int64)
+    best, best_types = -np.inf, types[:0]
+    if n < LEAST_CLASSES:
+        return best, best_types
     single, most = np.zeros(C, np.float32), np.float32(0.0)
-    for i in range(n):
-        row, top = evidence[listed[i]], np.float32(-np.inf)
-        for t in range(C):
-            single[t] += row[t]
-            top = max(top, row[t])
-        most += top
+    for i in listed:
+        single += log[i]
+        most += top[i]
     one = np.float64(single.max())
-    best, types = -np.inf, np.zeros(MOST_ROOMS, np.int64)
-    best_types = types[:0]
     if most - one < least:
         return best, best_types
     total, product = np.empty(n, np.float32), np.empty(C, np.float64)
     for _ in range(_STARTS):
         types[0] = np.argmax(single)
         single[types[0]] = -np.inf
-        for i in range(n):
-            total[i] = odds[listed[i], types[0]]
+        for k in range(n):
+            total[k] = odds[listed[k], types[0]]
         for K in range(2, MOST_ROOMS + 1):
             # The mean instead of the sum of odds keeps the product within float64.
             product[:] = 1.0
             share = np.float32(1.0) / np.float32(K)
-            for i in range(n):
-                row, before = odds[listed[i]], total[i]
+            for k in range(n):
+                of_class, before = odds[listed[k]], total[k]
                 for t in range(C):
-                    product[t] *= share * (before + row[t])
+                    product[t] *= share * (before + of_class[t])
             t = int(np.argmax(product))
             types[K - 1] = t
             value = 0.0
-            for i in range(n):
-                total[i] += odds[listed[i], t]
-                value += np.log(np.float64(share * total[i]))
+            for k in range(n):
+                total[k] += odds[listed[k], t]
+                value += np.log(np.float64(share * total[k]))
             if value - one > best:
                 best, best_types = value - one, types[:K].copy()
     return best, best_types
 
 
 def _parts(
-    evidence: Float[Floats, "V C"],
-    things: Sequence[SceneObject],
-    rows: Int[Indices, "N"],
-    types: Int[Indices, "K"],
+    model: SceneModel, things: Sequence[SceneObject], types: Int[Indices, "K"]
 ) -> dict[int, list[int]]:
     """Return the indices of the objects of each room type, in the order of the first object."""
     parts: dict[int, list[int]] = {}
+    rows = model.vocabulary.stand_in[np.array([thing.class_index for thing in things])]
+    r = model.room_evidence.log[rows]
     if any(thing.position is None for thing in things):
-        best = evidence[rows[:, None], types].argmax(1)
-        for row, t in enumerate(types[best].tolist()):
+        for row, t in enumerate(types[r[:, types].argmax(1)].tolist()):
             parts.setdefault(t, []).append(row)
         return parts
-    r = evidence[rows]
     points = np.array([thing.position[:2] for thing in things if thing.position])
     for members in _cut(r, points, np.arange(len(rows)), _MOST_CUTS):
         t = int(r[members].sum(0).argmax())

@@ -29,7 +29,7 @@ from sklearn.metrics import roc_auc_score
 
 from app.model import SceneModel
 from app.questions.alternatives import Guesses, label_probabilities
-from app.questions.doubt import believed, doubt, room_log_p
+from app.questions.doubt import believed, doubt, room_odds
 from app.questions.posterior import Posterior
 from app.questions.several_rooms import several_rooms
 from app.registry import Store
@@ -94,7 +94,11 @@ def intruders(model: SceneModel, scenes: Sequence[EncodedScene], detector: Detec
             doubted = believed(model, lists[1])
             ranks.append([1 / _rank(model, one, hidden) for one in (without, raw, doubted)])
             if encoded.room_type >= 0:
-                tables = without.room_log_p(), raw.room_log_p(), room_log_p(model, lists[1])[1]
+                tables = (
+                    without.room_log_p()[0],
+                    raw.room_log_p()[0],
+                    room_odds(model, lists[1]).log_p,
+                )
                 rooms.append([int(table.argmax()) == encoded.room_type for table in tables])
         for name, values in (("MRR", ranks), ("room", rooms)):
             _print_loss(f"{name}, intruder {law}", np.array(values, float))

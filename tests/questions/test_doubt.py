@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from app.model import RealFit
 from app.model.calibration import CountSlope
-from app.questions.doubt import LONG_LIST, believed, doubt, room_log_p
+from app.questions.doubt import LONG_LIST, believed, doubt, room_odds
 from app.questions.posterior import Posterior
 from app.scene import Scene
 from tests.questions.answers import misplaced, missing, outliers, rooms
@@ -170,18 +170,18 @@ def test_the_room_type_is_a_mixture_over_the_intruder(name):
     posterior = Posterior(artifact, scene_of(classes))
     logits = doubt(artifact, posterior, posterior.given_rest()[0]).logits
     least = int(logits.argmin())
-    p, total = np.exp(posterior.room_log_p()), 1.0
+    p, total = np.exp(posterior.room_log_p()[0]), 1.0
     for row, index in enumerate(classes):
         if row != least:
             others = [one for one in classes if one != index]
             weight = math.exp(logits[row]) * (math.e * 5 / LONG_LIST) ** 2
-            p = p + weight * np.exp(Posterior(artifact, scene_of(others)).room_log_p())
+            p = p + weight * np.exp(Posterior(artifact, scene_of(others)).room_log_p()[0])
             total += weight
-    _, log_p = room_log_p(artifact, scene_of(classes, room=1))
+    log_p = room_odds(artifact, scene_of(classes, room=1)).log_p
     assert np.exp(log_p) == pytest.approx(p / total, rel=2e-3)
 
 
 def test_the_room_type_of_a_single_class_is_that_of_the_machine():
     artifact = doubting(outlier=CountSlope(intercept=200.0))
-    log_p = room_log_p(artifact, scene_of([0]))[1]
-    assert log_p == pytest.approx(Posterior(artifact, scene_of([0])).room_log_p(), rel=1e-5)
+    log_p = room_odds(artifact, scene_of([0])).log_p
+    assert log_p == pytest.approx(Posterior(artifact, scene_of([0])).room_log_p()[0], rel=1e-5)

@@ -6,6 +6,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 import pytest
 
+from app.model.scene_model import RoomEvidence
 from app.questions.several_rooms import MOST_ROOMS, gain, several_rooms
 from tests.questions.artifacts import larger_artifact, scene_of
 
@@ -17,13 +18,19 @@ def by_force(r: np.ndarray) -> float:
     return max(np.log(np.exp(r[:, list(s)]).mean(1)).sum() for s in sets) - one
 
 
+def table(log: np.ndarray) -> RoomEvidence:
+    """The evidence of classes, none of them structure."""
+    log = log.astype(np.float32)
+    return RoomEvidence(log, np.exp(log), log.max(1), np.arange(len(log)))
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_the_gain_is_nearly_that_of_all_sets_of_types(seed):
     """The search is greedy from three starts, so it may miss better types."""
     rng = np.random.default_rng(seed)
     evidence = rng.normal(0, 2, (30, 7)).astype(np.float32)
     listed = np.sort(rng.permutation(30)[:12])
-    value, types = gain(evidence, np.exp(evidence), listed, 0.0)
+    value, types = gain(*table(evidence), np.append(rng.permutation(listed), listed[:3]), 0.0)
     best = by_force(evidence[listed].astype(float))
     assert 0.8 * best - 0.5 <= value <= best + 1e-3
     rows = evidence[listed][:, types].astype(float)
@@ -33,7 +40,17 @@ def test_the_gain_is_nearly_that_of_all_sets_of_types(seed):
 
 def test_a_small_bound_ends_the_search():
     evidence = np.zeros((6, 4), np.float32)
-    assert gain(evidence, np.exp(evidence), np.arange(6), 1.0)[0] == -np.inf
+    assert gain(*table(evidence), np.arange(6), 1.0)[0] == -np.inf
+
+
+def test_few_classes_and_structure_have_no_gain():
+    """The classes 6 and 7 are structure, and 8 is a word with the evidence of class 0."""
+    evidence = table(np.random.default_rng(0).normal(0, 2, (8, 4)))
+    evidence = evidence._replace(row=np.array([*range(6), -1, -1, 0]))
+    for listed in ([0, 1, 2, 3, 4, 6, 7], [0, 1, 2, 3, 4, 8]):
+        assert gain(*evidence, np.array(listed), -np.inf)[0] == -np.inf
+    six, more = (gain(*evidence, np.array([0, 1, 2, 3, 4, 5, *x]), 0.0)[0] for x in ([], [6, 8]))
+    assert -np.inf < six == more
 
 
 @pytest.fixture
@@ -42,8 +59,7 @@ def model():
     artifact = larger_artifact("triway-states", several_rooms=3.0)
     evidence = np.zeros((9, 2), np.float32)
     evidence[:3, 0] = evidence[3:6, 1] = 4.0
-    vars(artifact)["room_evidence"] = evidence
-    vars(artifact)["room_odds"] = np.exp(evidence)
+    vars(artifact)["room_evidence"] = table(evidence)
     return artifact
 
 

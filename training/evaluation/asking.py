@@ -21,7 +21,7 @@ from torch import Tensor
 from app import questions
 from app.inference.elementary import log_softmax
 from app.model import SceneModel, Sensitivity
-from app.questions.doubt import believed, room_log_p
+from app.questions.doubt import believed, room_odds
 from app.questions.misplaced import wrong_relations
 from app.questions.posterior import Posterior, calibrated_missing
 from app.scene import CANONICAL, OPPOSITES, RelationTable, Scene, SceneObject, canonicalise, observe
@@ -181,7 +181,7 @@ def score_rooms(
     index = profiles.index(profile) if profile in profiles else None
     log_p = np.zeros((len(v), artifact.spec.C))
     for row, scene in zip(log_p, _scenes(v), strict=True):
-        posterior, of_types = room_log_p(artifact, replace(scene, profile=index))
+        posterior, of_types, _ = room_odds(artifact, replace(scene, profile=index))
         sharpness = artifact.calibration.rooms.of(posterior.listed)  # exponent of p
         row[:] = log_softmax(sharpness * of_types)
     return torch.from_numpy(log_p)

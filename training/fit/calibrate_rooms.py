@@ -26,10 +26,10 @@ from torch import Tensor
 from app.inference.chains import random_stream
 from app.model import FitLimit, SceneModel, Sharpness
 from app.model.calibration import NO_LIMIT
-from app.questions.doubt import believed, room_log_p
+from app.questions.doubt import believed, room_odds
 from app.questions.generate import STEPS, room_fit
 from app.questions.posterior import Posterior
-from app.questions.several_rooms import LEAST_CLASSES, gain
+from app.questions.several_rooms import gain
 from app.scene import Scene
 from training.datasets.array_types import Table
 from training.datasets.batches import SceneTensors, subset
@@ -74,7 +74,7 @@ def fit_rooms(artifact: SceneModel, scenes: SceneTensors) -> Sharpness:
     parts = [draw_parts(scenes, structure_of(artifact), size) for size in sizes]
     v = torch.cat([part.v for part in parts])
     room = torch.cat([scenes.room[part.scene] for part in parts]).numpy()
-    log_p = np.stack([room_log_p(artifact, listed_scene(row))[1] for row in v])
+    log_p = np.stack([room_odds(artifact, listed_scene(row)).log_p for row in v])
     size = np.log(v.sum(1).numpy())
 
     def loss(weights: NDArray[np.float64]) -> float:
@@ -93,15 +93,11 @@ def fit_several_rooms(artifact: SceneModel, scenes: SceneTensors) -> float | Non
     """
     if artifact.spec.C < 2:
         return None
-    evidence, limits = artifact.room_evidence, list[float]()
+    limits = list[float]()
     for source in scenes.source.unique().tolist():
-        own = scenes.v[scenes.source == source].numpy() > 0
-        lists = [np.flatnonzero(row & ~artifact.vocabulary.structure) for row in own]
-        gains = [
-            gain(evidence, artifact.room_odds, listed, 0.0)[0]
-            for listed in lists
-            if len(listed) >= LEAST_CLASSES
-        ]
+        listed = map(np.flatnonzero, scenes.v[scenes.source == source].numpy() > 0)
+        gains = [gain(*artifact.room_evidence, classes, 0.0)[0] for classes in listed]
+        gains = [one for one in gains if one > -np.inf]
         if len(gains) >= _LARGE_SOURCE:
             limits.append(float(np.quantile(gains, _ONE_ROOM)))
     return max(limits, default=None)
