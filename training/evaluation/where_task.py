@@ -24,19 +24,20 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from app import questions
 from app.model import SceneModel
-from app.questions.where import where
+from app.questions.where import Room, where
 from app.scene.spatial_relations import SUPPORTS
+from training.datasets import EncodedScene
 from training.datasets.array_types import ClassMask
+from training.datasets.cases import scene_of
 from training.datasets.homes import NOWHERE, HomeCase, home_cases
 from training.evaluation.metrics import Metric, Ratio, Scored
 from training.evaluation.parts import of_classes
 from training.evaluation.setting import Outcome, Setting
-from training.fit.calibrate_where import kept_objects, rooms_of
 
 WHERE: Final = ("first room", "first three", "first place", "ECE")
 RIVALS: Final = ("first room, rooms alone", "first room, popularity")
@@ -76,6 +77,23 @@ def where_task(model: SceneModel, setting: Setting) -> Outcome | None:
     unit, score, truth = map(np.array, zip(*certainty, strict=True))
     metrics["ECE"] = Scored("ECE", unit, score, truth, np.arange(len(scenes)))
     return Outcome.over(scenes, metrics, 0)
+
+
+def rooms_of(artifact: SceneModel, case: HomeCase) -> list[Room]:
+    """Return the rooms of a case without the thing, and with their types."""
+    rooms = []
+    for number, encoded in enumerate(case.rooms):
+        kept = kept_objects(encoded, case.thing, artifact.vocabulary.structure)
+        rooms.append(Room(str(number), scene_of(encoded, kept.tolist(), ())))
+    return rooms
+
+
+def kept_objects(
+    encoded: EncodedScene, thing: int, structure: ClassMask
+) -> Int[NDArray[np.int64], "k"]:
+    """Return the indices of the objects of a room without the thing and without structure."""
+    classes = encoded.instance_classes
+    return np.flatnonzero(~structure[classes] & (classes != thing))
 
 
 def _top(values: Float[NDArray, "rooms"], room: int, k: int) -> float:

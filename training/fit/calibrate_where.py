@@ -12,37 +12,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import logsumexp
 
 from app.model import SceneModel, WhereFit
-from app.questions.where import Room, room_log_odds
+from app.questions.where import room_log_odds
 from training.datasets import EncodedScene
-from training.datasets.array_types import ClassMask
-from training.datasets.cases import scene_of
-from training.datasets.homes import NOWHERE, HomeCase, home_cases
+from training.datasets.homes import NOWHERE, home_cases
+from training.evaluation.where_task import rooms_of
 from training.fit.regression import LEAST_SCENES, RIDGE, logistic
 
 _STEEPEST = 4.0
-
-
-def rooms_of(artifact: SceneModel, case: HomeCase) -> list[Room]:
-    """Return the rooms of a case without the thing, and with their types."""
-    rooms = []
-    for number, encoded in enumerate(case.rooms):
-        kept = kept_objects(encoded, case.thing, artifact.vocabulary.structure)
-        rooms.append(Room(str(number), scene_of(encoded, kept.tolist(), ())))
-    return rooms
-
-
-def kept_objects(
-    encoded: EncodedScene, thing: int, structure: ClassMask
-) -> Int[NDArray[np.int64], "k"]:
-    """Return the indices of the objects of a room without the thing and without structure."""
-    classes = encoded.instance_classes
-    return np.flatnonzero(~structure[classes] & (classes != thing))
 
 
 def fit_where(artifact: SceneModel, scenes: Sequence[EncodedScene], seed: int = 0) -> WhereFit:

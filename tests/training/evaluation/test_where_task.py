@@ -7,8 +7,7 @@ from tests.questions.artifacts import LABELS, larger_artifact
 from tests.training.evaluation.scenes import scene, tensors
 from training.datasets.homes import NOWHERE, home_cases
 from training.evaluation.setting import Setting
-from training.evaluation.where_task import _top, where_task
-from training.fit.calibrate_where import kept_objects, rooms_of
+from training.evaluation.where_task import _top, kept_objects, rooms_of, where_task
 from training.fit.regression import structure_of
 
 V = len(LABELS)

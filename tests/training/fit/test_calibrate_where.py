@@ -8,8 +8,9 @@ from app.questions.where import room_log_odds
 from tests.questions.artifacts import LABELS, larger_artifact
 from tests.training.evaluation.scenes import scene
 from training.datasets.homes import NOWHERE, HomeCase
+from training.evaluation.where_task import rooms_of
 from training.fit import calibrate_where
-from training.fit.calibrate_where import fit_where, rooms_of
+from training.fit.calibrate_where import fit_where
 
 V = len(LABELS)
 WALL = LABELS.index("wall")
