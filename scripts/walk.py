@@ -26,7 +26,6 @@ from playwright.sync_api import Browser, sync_playwright
 from walk_robot import HABITS, VISITS
 from walk_tools import ROOT, Record, User, WalkError, require
 
-CONFIRMED = 4  # scenes of each habit that the user confirms
 HABIT_SCENES = {
     "motorcycle": {"objects": ["bed", "nightstand", "lamp", "motorcycle"], "room_type": "bedroom"},
     "oven": {"objects": ["sofa", "armchair", "lamp", "oven"], "room_type": "living room"},
@@ -175,16 +174,15 @@ class Walk(User):
         return answers
 
     def _confirm(self, url: str) -> None:
-        """Confirm some scenes of each habit on the page, and download the corrected file."""
+        """Confirm a scene of each habit on the page, and download the corrected file."""
         file, corrected = self._work / "scenes.home.jsonl", self._work / "corrected.jsonl"
         recorded = lines_of(file)
         require(len({labels(line) for line in recorded}) >= 20, "too few distinct scenes")
         require(len({line["group"] for line in recorded}) >= 5, "the scenes are of few hours")
         require(len(recorded) <= VISITS, "a visit was recorded twice")
         chosen = [
-            (number, habit)
+            (next(number for number, line in enumerate(recorded) if habit in labels(line)), habit)
             for habit in HABITS.values()
-            for number in [n for n, x in enumerate(recorded) if habit in labels(x)][:CONFIRMED]
         ]
         with self._page(url) as page:
             for number, habit in chosen:
@@ -198,6 +196,7 @@ class Walk(User):
                 page.get_by_role("button", name=f"Belongs here: {habit}").click()
                 if page.locator("#confirm-scene").is_visible():  # another alarm is open
                     page.locator("#confirm-scene").click()
+            page.get_by_text("Enough is confirmed").wait_for()
             self._record.picture(page, "confirmed", "A confirmed scene")
             page.get_by_role("button", name="Import, export").click()
             self._record.picture(page, "download", "The corrected file can be downloaded")
