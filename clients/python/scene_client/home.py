@@ -7,11 +7,10 @@ import logging
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
-
-from typing_extensions import Self
 
 from scene_client import schemas
 from scene_client.errors import ClientError, InvalidRequestError, ProblemError
@@ -54,7 +53,7 @@ FIRST_PAUSE, LONGEST_PAUSE = 2.0, 30.0  # seconds between tries; the pause doubl
 _logger: Final = logging.getLogger(__name__)
 
 
-class Home:
+class Home(AbstractContextManager["Home"]):
     """State between a detector and the questions about the rooms of a home, for one thread.
 
     Args:
@@ -159,9 +158,8 @@ class Home:
             step = self._step(elapsed, self.settings.hold)
             verdict, former = None if self._is_habit(track) else track.verdict, track.alarm.value
             if track.is_confirmed and track.alarm.update(verdict, self._now, step):
-                yield self._event(
-                    cast(Kind, verdict or "cleared"), track, track.alarm.since, former
-                )
+                kind = cast(Kind, verdict or "cleared")
+                yield self._event(kind, track, track.alarm.since, former)
 
     def _settle(self, elapsed: float) -> Iterator[Event]:
         """Count the answer about the type of the robot's room, in proportion to its probability."""
@@ -281,8 +279,7 @@ class Home:
 
     def room_type(self, room: str | None = None) -> str | None:
         """Return the type of a room, by default of the robot's room, or else the likeliest one."""
-        name = self.room if room is None else room
-        known = self._rooms.get(name, Room())
+        known = self._rooms.get(name := self.room if room is None else room, Room())
         return known.settled_type(name) or known.best
 
     def coverage(self, room: str | None = None) -> float:
@@ -398,9 +395,6 @@ class Home:
         if self.path is not None:
             atexit.unregister(self.close)
             self._try_save()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
