@@ -100,12 +100,15 @@ class WhereFit(Frozen):
     """The rooms of a thing in `/where`, with the log-odds l_r of `/missing` for each room r.
 
     p(room r | it is in one of the rooms) is the softmax of slope·l_r. The log-odds that it is in
-    one of them are intercept + here·log sum_r exp(l_r).
+    one of them are intercept + here·log sum_r exp(l_r). Within a room, a place of the log-odds q
+    has the weight exp(place_intercept + place_slope·q), and the rest of the room has 1.
     """
 
     slope: Annotated[float, Field(ge=0)] = 1.0
     here: Annotated[float, Field(ge=0)] = 1.0
     intercept: float = 0.0
+    place_slope: Annotated[float, Field(ge=0)] = 1.0
+    place_intercept: float = 0.0
 
 
 PlaceFits = Annotated[Many[PlaceFit], Field(max_length=len(CANONICAL))]

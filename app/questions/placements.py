@@ -168,26 +168,22 @@ def every_placement(
     axes: Axes,
     *,
     has_viewer: bool = True,
-) -> list[Fields]:
-    """Return all places of an absent class on, in and under objects, likeliest first.
+) -> list[tuple[float, list[Fields]]]:
+    """Return all places of an absent class on, in and under classes, likeliest first.
 
-    The places have at least the probability `LEAST_OF_EVERY`. Objects of one class share their
-    probability. Only the first of them has an offset.
+    Each place has its probability, at least `LEAST_OF_EVERY`, and the fields of the place at each
+    object of the class. Only the first object has an offset.
     """
-    present, found = posterior.present, list[Fields]()
+    present, found = posterior.present, list[tuple[float, list[Fields]]]()
     names = {scene.objects[k].id: row for row, k in enumerate(present.first.tolist())}
     (places,) = placements(
         model, posterior, scene, np.array([candidate]), axes, has_viewer=has_viewer, every=True
     )
     for place in places:
-        row = names[place["object"]]
-        share = place["probability"] / int(present.counts[row])
-        found.append(place | {"probability": share})
-        others = np.flatnonzero(present.row == row).tolist()
-        for number in others if len(others) > 1 else ():
-            if (other := scene.objects[number]).id != place["object"]:
-                fields = {"relation": place["relation"], "object": other.id}
-                found.append(fields | {"probability": share})
+        row, p = names[place["object"]], place.pop("probability")
+        others = [scene.objects[k].id for k in np.flatnonzero(present.row == row).tolist()]
+        others.remove(place["object"])
+        found.append((p, [place, *({"relation": place["relation"], "object": x} for x in others)]))
     return found
 
 

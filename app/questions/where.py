@@ -6,9 +6,11 @@ given the objects and the type of the room. Then
     p(room r | it is in one of the rooms) = softmax_r(slope·l_r)
     p(it is in one of the rooms) = sigmoid(intercept + here·log sum_r exp(l_r))
 
-with the coefficients of `WhereFit`. Within the room, it is on, in or under an object with the
-probabilities of the placements of `/missing`, divided by their sum if this is above 1. The rest of
-the room has the rest of the probability. Several objects of a class share it equally.
+with the coefficients of `WhereFit`. Within the room, it is on, in or under an object, or in the
+rest of the room. With the log-odds q_k of the placements of `/missing`, the weight of place k is
+exp(place_intercept + place_slope·q_k), and that of the rest is 1. With the default coefficients,
+these are the probabilities of independent places given that at most one is right. Several objects
+of a class share the weight of their place equally.
 
 A listed thing of the class, or of a kind of it, is the wanted thing with the probability `real` of
 `app.questions.doubt`, at most `_MOST_CERTAIN`. A listed thing of a broader class counts with the
@@ -32,6 +34,7 @@ from numpy.typing import NDArray
 
 from app.errors import InvalidRequestError, Location
 from app.inference.elementary import softmax
+from app.model.calibration import WhereFit
 from app.model.scene_model import SceneModel
 from app.questions.answer import Fields, named, rounded_number
 from app.questions.doubt import believed, doubt
@@ -51,7 +54,7 @@ LOOK: Final = 0.8
 _MOST_CERTAIN: Final = 0.98  # probability of a listed thing, which may have been carried away
 _BROADER: Final = 0.5  # share of the listed chairs that count as the wanted office chair
 _LEAST_MISSED: Final = 1e-6
-_LEAST_SHOWN: Final = 1e-6  # least probability of a place in the answer
+_LEAST_PLACE: Final = 1e-4  # a place is that uncertain at least
 
 NOWHERE: Final = -1
 """Index of the room of a thing that is in no room."""
@@ -182,14 +185,21 @@ def _spots(
     yield Spot(NOWHERE, hidden - here, {})
     shares = (here * softmax(fit.slope * log_odds)).tolist()
     for row, (posterior, scene, share) in enumerate(zip(posteriors, others, shares, strict=True)):
-        left = 1.0
         placed = every_placement(model, posterior, scene, wanted, axes, has_viewer=has_viewer)
-        scale = max(1.0, math.fsum(fields["probability"] for fields in placed))
-        for fields in placed:
-            p = fields.pop("probability") / scale
-            left -= p
-            yield Spot(row, share * p, fields)
-        yield Spot(row, share * max(left, 0.0), {})
+        weights = place_weights(fit, np.array([p for p, _ in placed])).tolist()
+        unit = share / (1.0 + math.fsum(weights))
+        for weight, (_, alike) in zip(weights, placed, strict=True):
+            for fields in alike:
+                yield Spot(row, unit * weight / len(alike), fields)
+        yield Spot(row, unit, {})
+
+
+def place_weights(
+    fit: WhereFit, p: Float[NDArray[np.float64], "k"]
+) -> Float[NDArray[np.float64], "k"]:
+    """Return the weights of places with the probabilities p. The rest of the room has 1."""
+    p = np.clip(p, _LEAST_PLACE, 1.0 - _LEAST_PLACE)
+    return np.exp(fit.place_intercept + fit.place_slope * np.log(p / (1.0 - p)))
 
 
 def _shares_of_listed(model: SceneModel, wanted: int) -> Float[NDArray[np.float64], "V"]:

@@ -1,5 +1,6 @@
 """The question `where`: its rooms and places by hand, listed things and searches."""
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -9,11 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.model import RealFit, WhereFit
-from app.questions.where import LOOK, Room, Search, room_log_odds, where
+from app.questions.doubt import believed
+from app.questions.missing import VIEWER
+from app.questions.placements import every_placement
+from app.questions.where import LOOK, Room, Search, place_weights, room_log_odds, where
 from tests.questions.answers import missing
 from tests.questions.artifacts import LABELS, LARGER, larger_artifact, scene_of
 
-FIT = WhereFit(slope=0.8, here=0.5, intercept=0.7)
+FIT = WhereFit(slope=0.8, here=0.5, intercept=0.7, place_slope=0.9, place_intercept=0.4)
 THING = LABELS.index("vase")
 HOME = [Room("a", scene_of([0, 1, 2])), Room("b", scene_of([6, 6, 3])), Room("c", scene_of([]))]
 
@@ -48,6 +52,37 @@ def test_the_rooms_follow_the_formula(artifact):
     assert answer["not_here"] == pytest.approx(1 - here, abs=1e-5)
     shown = [entry["probability"] for entry in answer["rooms"]]
     assert shown == sorted(shown, reverse=True)
+
+
+def test_the_places_of_a_room_follow_the_formula():
+    artifact, room = larger_artifact("triway", where=FIT), HOME[1]
+    placed = every_placement(artifact, believed(artifact, room.scene), room.scene, THING, VIEWER)
+    weights = {
+        (fields["relation"], fields["object"]): math.exp(0.4) * (p / (1 - p)) ** 0.9 / len(alike)
+        for p, alike in placed
+        for fields in alike
+    }
+    total_weight = 1 + sum(weights.values())
+    answer = where(artifact, [room], THING, top_k=500)
+    found = {
+        (one.get("relation"), one.get("object")): one["probability"] for one in answer["places"]
+    }
+    here = by_room(answer)["b"]
+    assert found.pop((None, None)) == pytest.approx(here / total_weight, rel=1e-3)
+    assert len(found) == len(weights) > 0
+    for place, weight in weights.items():
+        assert found[place] == pytest.approx(here * weight / total_weight, rel=1e-3)
+
+
+def test_by_default_the_places_are_independent_events_of_which_at_most_one_holds():
+    """By enumeration of all combinations of three places."""
+    p = np.array([0.3, 0.9, 0.05])
+    combinations = np.array(list(itertools.product([False, True], repeat=3)))
+    probability = np.where(combinations, p, 1 - p).prod(1)
+    single = combinations.sum(1) == 1
+    expected = [probability[single & combinations[:, k]].sum() for k in range(3)]
+    none = probability[combinations.sum(1) == 0].sum()
+    assert place_weights(WhereFit(), p) == pytest.approx(np.array(expected) / none)
 
 
 def total(answer):

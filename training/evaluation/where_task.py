@@ -16,6 +16,9 @@ For ties, a metric is the expectation under random order.
 
     ECE               calibration error of the probability of the first room, also for things that
                       were never there
+    ECE, places       calibration error of the probability of the first place, likewise, where
+                      relations are annotated. A thing without a supporter is in the rest of its
+                      room
 """
 
 from __future__ import annotations
@@ -30,7 +33,7 @@ from numpy.typing import NDArray
 from app import questions
 from app.model import SceneModel
 from app.questions.where import Room, where
-from app.scene.spatial_relations import SUPPORTS
+from app.scene.spatial_relations import RELATIONS, SUPPORTS
 from training.datasets import EncodedScene
 from training.datasets.array_types import ClassMask
 from training.datasets.cases import scene_of
@@ -39,7 +42,8 @@ from training.evaluation.metrics import Metric, Ratio, Scored
 from training.evaluation.parts import of_classes
 from training.evaluation.setting import Outcome, Setting
 
-WHERE: Final = ("first room", "first three", "first place", "ECE")
+WHERE: Final = ("first room", "first three", "first place", "ECE", "ECE, places")
+SUPPORT_NAMES: Final = tuple(RELATIONS[a] for a in SUPPORTS)
 RIVALS: Final = ("first room, rooms alone", "first room, popularity")
 
 
@@ -52,7 +56,7 @@ def where_task(model: SceneModel, setting: Setting) -> Outcome | None:
     if not model.spec.C or not cases:
         return None
     rows: dict[str, list[tuple[int, float]]] = {name: [] for name in (*WHERE[:3], *RIVALS)}
-    certainty = list[tuple[int, float, bool]]()
+    certainty, of_places = list[tuple[int, float, bool]](), list[tuple[int, float, bool]]()
     for case in cases:
         scene = index[case.rooms[0].source, case.rooms[0].scene_id]
         answer = where(model, rooms_of(model, case), case.thing)
@@ -60,6 +64,10 @@ def where_task(model: SceneModel, setting: Setting) -> Outcome | None:
         for entry in answer["rooms"]:
             p[int(entry["room"])] = entry["probability"]
         certainty.append((scene, float(p.max()), int(p.argmax()) == case.room))
+        place, supporters = answer["places"][0], supporters_of(case, structure)
+        is_right = supporters is not None and _is_place(case, place, supporters, structure)
+        if supporters is not None:
+            of_places.append((scene, place["probability"], is_right))
         if case.room == NOWHERE:
             continue
         rows["first room"].append((scene, _top(p, case.room, 1)))
@@ -67,15 +75,17 @@ def where_task(model: SceneModel, setting: Setting) -> Outcome | None:
         rows["first room, rooms alone"].append((scene, _top(_alone(model, case), case.room, 1)))
         sizes = np.array([len(room.instance_classes) for room in case.rooms], float)
         rows["first room, popularity"].append((scene, _top(sizes, case.room, 1)))
-        if (is_right := _is_supporter(case, answer["places"][0], structure)) is not None:
+        if supporters:
             rows["first place"].append((scene, float(is_right)))
     metrics: dict[str, Metric] = {}
     for name, values in rows.items():
         if values:
             index_of, right = map(np.array, zip(*values, strict=True))
             metrics[name] = Ratio.of_items(index_of, right, len(scenes))
-    unit, score, truth = map(np.array, zip(*certainty, strict=True))
-    metrics["ECE"] = Scored("ECE", unit, score, truth, np.arange(len(scenes)))
+    for name, answers in (("ECE", certainty), ("ECE, places", of_places)):
+        if answers:
+            unit, score, truth = map(np.array, zip(*answers, strict=True))
+            metrics[name] = Scored("ECE", unit, score, truth, np.arange(len(scenes)))
     return Outcome.over(scenes, metrics, 0)
 
 
@@ -103,18 +113,42 @@ def _top(values: Float[NDArray, "rooms"], room: int, k: int) -> float:
     return float(np.clip((k - above) / ties, 0.0, 1.0))
 
 
-def _is_supporter(case: HomeCase, place: Mapping[str, Any], structure: ClassMask) -> bool | None:
-    """Return whether a place names the class on or in which the thing was; None if unknown."""
-    encoded = case.rooms[case.room]
+def supporters_of(case: HomeCase, structure: ClassMask) -> set[int] | None:
+    """Return the classes on or in which the thing was, without structure.
+
+    None if the relations of the room are not annotated.
+    """
+    encoded = case.rooms[max(case.room, 0)]
+    if not encoded.instance_observed[[*SUPPORTS]].any():
+        return None
+    if case.room == NOWHERE:
+        return set()
     (instance,) = np.flatnonzero(encoded.instance_classes == case.thing)
     supporters = np.flatnonzero(encoded.instance_holds[[*SUPPORTS], instance].any(0))
     classes = set(encoded.instance_classes[supporters].tolist())
-    if not classes or structure[list(classes)].any():
-        return None
-    if int(place["room"]) != case.room or place.get("relation") not in ("on-top", "inside"):
+    return set() if structure[list(classes)].any() else classes
+
+
+def is_supporter(
+    case: HomeCase, place: Mapping[str, Any], supporters: set[int], structure: ClassMask
+) -> bool:
+    """Return whether a place in the thing's room is on or in an object of the supporters."""
+    if place.get("relation") not in SUPPORT_NAMES:
         return False
+    encoded = case.rooms[case.room]
     kept = kept_objects(encoded, case.thing, structure)
-    return int(encoded.instance_classes[kept[int(place["object"])]]) in classes
+    return int(encoded.instance_classes[kept[int(place["object"])]]) in supporters
+
+
+def _is_place(
+    case: HomeCase, place: Mapping[str, Any], supporters: set[int], structure: ClassMask
+) -> bool:
+    """Return whether a place is that of the thing."""
+    if int(place["room"]) != case.room:
+        return False
+    if not supporters:
+        return "relation" not in place
+    return is_supporter(case, place, supporters, structure)
 
 
 def _alone(model: SceneModel, case: HomeCase) -> Float[NDArray, "rooms"]:

@@ -39,26 +39,31 @@ def setting(model):
 def test_figures_are_those_of_the_answers(model, setting):
     metrics = where_task(model, setting).metrics
     first, three, place, popular, right = [], [], [], [], []
+    of_places = []  # whether the first place is right
     for case in home_cases(setting.scenes.scenes, model.vocabulary.structure, setting.seed):
         answer = where(model, rooms_of(model, case), case.thing)
         right.append(int(answer["rooms"][0]["room"]) == case.room)
+        top = answer["places"][0]
+        if case.room == NOWHERE or case.thing != LAMP:
+            of_places.append(int(top["room"]) == case.room and "relation" not in top)
         if case.room == NOWHERE:
             continue
         first.append(right[-1])
         three.append(True)  # of three rooms
         popular.append(case.room == 2)  # five objects
         if case.thing == LAMP:  # the only thing with a supporter
-            top = answer["places"][0]
             kept = kept_objects(case.rooms[1], LAMP, model.vocabulary.structure)
             on_desk = case.rooms[1].instance_classes[kept[int(top.get("object", 0))]] == DESK
             is_there = top["room"] == "1" and top.get("relation") in ("on-top", "inside")
             place.append(bool(is_there and on_desk))
+            of_places.append(place[-1])
     assert metrics["first room"].value == pytest.approx(np.mean(first))
     assert metrics["first three"].value == np.mean(three)
     assert metrics["first room, popularity"].value == pytest.approx(np.mean(popular))
     assert metrics["first place"].value == pytest.approx(np.mean(place))
     assert 0 <= metrics["first room, rooms alone"].value <= 1
     assert 0 <= metrics["ECE"].value <= 1
+    assert metrics["ECE, places"].truth.tolist() == of_places
 
 
 def test_ties_are_in_random_order():

@@ -4,7 +4,11 @@ from scipy.special import expit, logsumexp
 
 from app.inference.elementary import softmax
 from app.model import WhereFit
-from app.questions.where import room_log_odds
+from app.questions.doubt import believed
+from app.questions.missing import VIEWER
+from app.questions.placements import every_placement
+from app.questions.where import place_weights, room_log_odds
+from app.scene.spatial_relations import canonicalise
 from tests.questions.artifacts import LABELS, larger_artifact
 from tests.training.evaluation.scenes import scene
 from training.datasets.homes import NOWHERE, HomeCase
@@ -21,10 +25,29 @@ def model():
     return larger_artifact("triway-states")
 
 
-@pytest.mark.parametrize("fit", [WhereFit(slope=0.6, here=0.9, intercept=0.5)])
-def test_the_fit_that_draws_the_rooms_is_found(model, monkeypatch, fit):
-    """3,000 things determine the slope within .1, and the two others within .3."""
-    rng, cases = np.random.default_rng(0), []
+FIT = WhereFit(slope=0.6, here=0.9, intercept=0.5, place_slope=0.7, place_intercept=0.8)
+
+
+def with_thing(model, room, thing, rng):
+    """The room with the thing at a place that is drawn by `FIT`."""
+    (bare,) = rooms_of(model, HomeCase([room], thing, NOWHERE, 0))
+    posterior = believed(model, bare.scene)
+    placed = every_placement(model, posterior, bare.scene, thing, VIEWER)
+    weights = np.append(place_weights(FIT, np.array([p for p, _ in placed])), 1.0)
+    number, triples = int(rng.choice(len(weights), p=weights / weights.sum())), []
+    if number < len(placed):
+        place = placed[number][1][0]
+        other = next(one.class_index for one in bare.scene.objects if one.id == place["object"])
+        relation, subject, _ = canonicalise(str(thing), place["relation"], str(other))
+        ends = (thing, other) if subject == str(thing) else (other, thing)
+        triples = [(relation, *ends)]
+    classes = sorted([*room.instance_classes.tolist(), thing])
+    return scene(classes, triples, room=room.room_type)
+
+
+def test_the_fit_that_draws_the_places_is_found(model, monkeypatch):
+    """3,000 things determine the slopes within .1, and the others within .3."""
+    rng, cases, fit = np.random.default_rng(0), [], FIT
     for number in range(3000):
         thing = int(rng.integers(V - 1))
         others = np.setdiff1d(np.arange(V - 1), thing)
@@ -36,6 +59,7 @@ def test_the_fit_that_draws_the_rooms_is_found(model, monkeypatch, fit):
         log_odds = room_log_odds(model, rooms_of(model, case), thing)
         if rng.random() < expit(fit.intercept + fit.here * logsumexp(log_odds)):
             room = int(rng.choice(3, p=softmax(fit.slope * log_odds)))
+            rooms[room] = with_thing(model, rooms[room], thing, rng)
             case = HomeCase(rooms, thing, room, number)
         cases.append(case)
     monkeypatch.setattr(calibrate_where, "home_cases", lambda *_: cases)
@@ -43,6 +67,8 @@ def test_the_fit_that_draws_the_rooms_is_found(model, monkeypatch, fit):
     assert found.slope == pytest.approx(fit.slope, abs=0.1)
     assert found.here == pytest.approx(fit.here, abs=0.3)
     assert found.intercept == pytest.approx(fit.intercept, abs=0.3)
+    assert found.place_slope == pytest.approx(fit.place_slope, abs=0.1)
+    assert found.place_intercept == pytest.approx(fit.place_intercept, abs=0.3)
 
 
 def test_rooms_are_shown_without_the_thing_and_structure(model):
