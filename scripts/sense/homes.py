@@ -6,7 +6,7 @@
 For each split, a model is trained without its test scenes, and calibrated. Nothing is published.
 Printed are the metrics of the task `Where` (`training.evaluation.where_task`) of the test houses,
 and the differences of the first room to both rivals, with intervals of 95 %. A split takes about
-eight minutes on two cores.
+six minutes on two cores.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ def by_force(r: np.ndarray) -> float:
 
 
 def table(log: np.ndarray) -> RoomEvidence:
-    """The evidence of classes, none of them structure."""
+    """The evidence of classes without structure."""
     log = log.astype(np.float32)
     return RoomEvidence(log, np.exp(log), log.max(1), np.arange(len(log)))
 

@@ -49,7 +49,7 @@ def two_sources(scenes):
 
 def test_every_task_has_an_outcome():
     report = report_of(MODEL, SETTING)
-    # The setting names no facts, and its scenes are no homes.
+    # The setting has neither facts nor homes.
     silent = {task for task, outcome in report.outcomes.items() if outcome is None}
     assert silent == {"Everyday", "Where"}
     assert all(np.isfinite(list(values_of(report).values())))

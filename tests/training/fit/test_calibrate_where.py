@@ -47,7 +47,7 @@ def with_thing(model, room, thing, rng):
 
 def test_the_fit_that_draws_the_places_is_found(model, monkeypatch):
     """3,000 things determine the slopes within .1, and the others within .3."""
-    rng, cases, fit = np.random.default_rng(0), [], FIT
+    rng, cases = np.random.default_rng(0), []
     for number in range(3000):
         thing = int(rng.integers(V - 1))
         others = np.setdiff1d(np.arange(V - 1), thing)
@@ -57,18 +57,18 @@ def test_the_fit_that_draws_the_places_is_found(model, monkeypatch):
         ]
         case = HomeCase(rooms, thing, NOWHERE, number)
         log_odds = room_log_odds(model, rooms_of(model, case), thing)
-        if rng.random() < expit(fit.intercept + fit.here * logsumexp(log_odds)):
-            room = int(rng.choice(3, p=softmax(fit.slope * log_odds)))
+        if rng.random() < expit(FIT.intercept + FIT.here * logsumexp(log_odds)):
+            room = int(rng.choice(3, p=softmax(FIT.slope * log_odds)))
             rooms[room] = with_thing(model, rooms[room], thing, rng)
             case = HomeCase(rooms, thing, room, number)
         cases.append(case)
     monkeypatch.setattr(calibrate_where, "home_cases", lambda *_: cases)
     found = fit_where(model, [])
-    assert found.slope == pytest.approx(fit.slope, abs=0.1)
-    assert found.here == pytest.approx(fit.here, abs=0.3)
-    assert found.intercept == pytest.approx(fit.intercept, abs=0.3)
-    assert found.place_slope == pytest.approx(fit.place_slope, abs=0.1)
-    assert found.place_intercept == pytest.approx(fit.place_intercept, abs=0.3)
+    assert found.slope == pytest.approx(FIT.slope, abs=0.1)
+    assert found.here == pytest.approx(FIT.here, abs=0.3)
+    assert found.intercept == pytest.approx(FIT.intercept, abs=0.3)
+    assert found.place_slope == pytest.approx(FIT.place_slope, abs=0.1)
+    assert found.place_intercept == pytest.approx(FIT.place_intercept, abs=0.3)
 
 
 def test_rooms_are_shown_without_the_thing_and_structure(model):
