@@ -60,7 +60,7 @@ def _read(data: ScenesRequest, request_id: str, limit: int, stop: Callable[[], b
         raise UnreadableFileError(detail=detail)
     try:
         labels = None if data.label_map is None else labels_in(data.label_map)
-        readers = scenes_of(content, data.name, labels)
+        readers = scenes_of(content, labels)
     except MessageError as error:
         raise UnreadableFileError(detail=_in_one_line(str(error))) from None
     converted: list[bytes] = []

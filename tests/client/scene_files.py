@@ -13,7 +13,7 @@ class Example:
     text: str
     request: dict[str, Any]
     notes: tuple[str, ...] = ()
-    labels: str | None = None  # name of the label map
+    labels: Any = None  # name of the label map, or the labels by their ids
     scene: str | None = None  # name of the scene to read, if the file has several
 
 
@@ -34,8 +34,8 @@ EXAMPLES = {
     **{name: Example(content(name), **members) for name, members in EXPECTED.items()},
     "thousands.json": Example(
         json.dumps(CHAIRS),
-        {"objects": KEPT, "unknown_labels": "nearest-or-ignore", "relations": []},
-        notes=("no-box",) * 256 + ("too-many",) * 2744,
+        {"objects": KEPT, "unknown_labels": "nearest-or-ignore"},
+        notes=("no-box",) + ("too-many",) * 2744,
         labels="coco91",
     ),
 }
@@ -57,7 +57,6 @@ REFUSED: dict[str, tuple[str, str]] = {
         json.dumps({"images": [], "annotations": [{"id": 1, "image_id": 1, "caption": "A bed."}]}),
         "instances_",
     ),
-    "classes.json": (json.dumps([{"name": "bed", "class": 1, "confidence": 0.9}]), "classifier"),
     "truncated.json": (content("hydra.json")[:-200], "not JSON"),
     "truncated.xml": (content("cvat.xml")[:-30], "not XML"),
     "deep.json": ("[" * 5_000 + "]" * 5_000, "nesting is too deep"),
@@ -65,17 +64,29 @@ REFUSED: dict[str, tuple[str, str]] = {
         '<!DOCTYPE a [<!ENTITY b "bbbbbbbbbb">]><annotations>&b;</annotations>',
         "document type",
     ),
-    "page.xml": ("<html><body/></html>", "root <html>"),
-    "echo.txt": ("header:\n  stamp:\n    sec: 1\ndetections: []\n", "YAML"),
-    "no_header.csv": ("desk,2.0,0.0,0.37\n", "not JSON"),
-    "words.csv": ("label,x,y,z\ndesk,two,0,0\n", "line 2, column x: 'two'"),
-    "unknown.json": ('{"shapes": [], "version": "5.0"}', "shapes, version"),
-    "value.json": ("3", "a JSON value"),
-    "empty.json": ("", "not JSON"),
+    "page.html": ("<!doctype html><html><body/></html>", "this is a web page"),
+    "other.xml": ("<kml><Document/></kml>", "root <kml>"),
+    "numbers.yaml": ("0: chair\n1: table\n", "label map"),
+    "aliases.yaml": ("objects: [&a bed, *a, *a]\n", "aliases"),
+    "damaged.yaml": ("objects:\n- [bed\n- chair: {\n", "see line"),
+    "no_header.csv": ("desk,2.0,0.0,0.37\n", "without a header"),
+    "words.csv": ("label,x,y,z\ndesk,two,0,0\n", "line 2, x,y,z: 'two' is not a number"),
+    "scored.txt": ("a chair 0.9\nthe small lamp\n", "no known format"),
+    "tracks.txt": ("1,1,40,120,260,290,0.91,-1,-1,-1\n", "MOTChallenge"),
+    "unknown.json": ('{"shapes": [{"label": "bed"}], "version": "5.0"}', "nearest is LabelMe"),
+    "other.json": ('{"rooms": {"a": 1}}', "fields rooms"),
+    "value.json": ("3", "no known format"),
+    "empty.json": ("", "the file is empty"),
+    "relations.json": ('{"scans": [{"relationships": [[1, 2, 15, "on"]]}]}', "objects.json"),
+    "devices.json": ('[{"id": "d1", "area_id": "kitchen", "name": "Fridge"}]', "Home Assistant"),
+    "world.sdf": ('<?xml version="1.0"?>\n<sdf version="1.9"><world/></sdf>', "an SDF world"),
+    "kitchen.usda": ('#usda 1.0\ndef Xform "World" {}\n', "this is USD"),
+    "tidy.pddl": ("(define (problem tidy) (:objects cup1 - cup))", "PDDL"),
+    "map.pbtxt": ('item {\n id: 1\n display_name: "chair"\n}\n', "label map"),
     "twins.json": (json.dumps({"objects": [{"id": 1, "label": "bed"}] * 2}), "training format"),
-    "no_type.json": (
-        json.dumps({"objects": [{"objectType": "Bed", "position": {"x": 1}}]}),
-        "looks like AI2-THOR",
+    "no_label.json": (
+        json.dumps({"edges": [], "nodes": [{"id": 1, "attributes": {"type": "ObjectNode"}}]}),
+        "looks like Hydra",
     ),
     "empty.csv": ("label,x,y,z\n", "no objects"),
 }

@@ -15,9 +15,8 @@ from app.registry import Store
 from scene_client import from_data
 from scene_client.ros_fields import COCO, MessageError
 from scene_client.schemas import SceneRequest
+from scene_client.sightings import MAX_OBJECTS, SceneFields
 from scene_client.vision_msgs import (
-    MAX_OBJECTS,
-    SceneFields,
     from_detection2d_array,
     from_detection3d_array,
     from_message,
@@ -118,8 +117,7 @@ def bed(**fields: Any) -> dict[str, Any]:
     [
         # The hypothesis of the highest score counts, wherever it stands in the list.
         (seen(*map(result, ("cat", "bed", "cow", "ant"), SCORES)), SIZED | UPRIGHT, None),
-        # Scores in per cent are clipped.
-        (seen(result("bed", 87.0)), SIZED | UPRIGHT | {"confidence": 1.0}, "high-score"),
+        (seen(result("bed", 120.0)), SIZED | UPRIGHT | {"confidence": 1.0}, "high-score"),
         # A flat box has a size.
         (bed(size=(2, 3, 0)), BED | UPRIGHT | {"size": {"x": 2, "y": 3, "z": 0}}, None),
         (bed(size=(0, 1, 1)), BED | UPRIGHT | {"size": {"x": 0, "y": 1, "z": 1}}, None),

@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from scene_client.vision_msgs import SceneFields, from_message
+from scene_client.sightings import SceneFields
+from scene_client.vision_msgs import from_message
 from tests.deploy.ros import from_json
 
 

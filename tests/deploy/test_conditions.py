@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from scene_client import Client
-from scene_client.vision_msgs import SceneFields
+from scene_client.sightings import SceneFields
 from tests.client import callers
 from tests.conftest import run_program
 

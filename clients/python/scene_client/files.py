@@ -2,47 +2,48 @@
 
 from __future__ import annotations
 
-import csv
-import json
 import os
 import re
 import sys
+from collections.abc import Callable
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final
-from xml.etree import ElementTree
 
-from scene_client.formats import Reader, chosen, from_data, scenes_in
+from scene_client.formats import Reader, are_records, chosen, from_data, scenes_in
 from scene_client.home_state import FORMAT, state_of
-from scene_client.image_formats import Lines
+from scene_client.parsing import Parts, json_value, parsed, text_of, yaml_values
 from scene_client.ros_fields import WELL_KNOWN, LabelMap, MessageError, read_label_map
-from scene_client.vision_msgs import SceneFields
-from scene_client.world_formats import LABEL_COLUMNS, Table
+from scene_client.sightings import SceneFields
 
 MAX_FILE: Final = 64 * 2**20
 """Maximum size of a scene file in bytes. The service has the same upper limit for a body."""
 
 # A file, and the name of one of its scenes. Some of these kinds of files are refused with a reason.
 _FILE: Final = re.compile(
-    r"(?P<file>.+\.(json|jsonl|csv|txt|xml|ya?ml|zip|gz))(:(?P<scene>.+))?", re.DOTALL
+    r"(?P<file>.+\.(json|jsonl|ndjson|csv|tsv|txt|xml|ya?ml|mcap|zip|gz))(:(?P<scene>.+))?",
+    re.DOTALL,
 )
 _PATH_STARTS: Final = (".", "~", os.sep)
-
-_YAML: Final = (
-    "this is YAML, as `ros2 topic echo` prints it: convert it to JSON, for example by "
-    "python -c 'import json, sys, yaml; print(json.dumps(next(yaml.safe_load_all(sys.stdin))))'"
-)
-_PART: Final = 2**16  # characters of XML
-_PACKED: Final = (
-    "this is compressed: extract it, and choose one of its .json, .xml, .csv or .txt files"
-)
 
 
 def is_file(argument: str) -> bool:
     """Return whether an argument of the command is a file. Labels such as sofa/couch are not."""
-    if argument == "-" or _FILE.fullmatch(argument):
+    if argument == "-" or _FILE.fullmatch(argument) or Path(argument).is_file():
         return True
-    return os.sep in argument and (argument.startswith(_PATH_STARTS) or Path(argument).exists())
+    is_path = argument.startswith(_PATH_STARTS) and os.sep in argument
+    return is_path or _split(argument)[1] is not None
+
+
+def _split(name: str) -> tuple[str, str | None]:
+    """Return the name of a file and the name of a scene in it, or None."""
+    if Path(name).exists():
+        return name, None
+    if (parts := _FILE.fullmatch(name)) is not None:
+        return parts["file"], parts["scene"]
+    file, _, scene = name.partition(":")
+    return (file, scene) if scene and Path(file).is_file() else (name, None)
 
 
 def from_file(
@@ -65,38 +66,56 @@ def from_file(
     name, labels = os.fspath(path), label_map
     if isinstance(labels, str):
         labels = label_map_of(labels)
-    if scene is None and not Path(name).exists() and (parts := _FILE.fullmatch(name)):
-        name, scene = parts["file"], parts["scene"]
+    if scene is None:
+        name, scene = _split(name)
     content = _bytes(name)
     try:
-        return chosen(scenes_of(content, name, labels), scene, name)()
+        return chosen(scenes_of(content, labels), scene, name)()
     except MessageError as error:
         raise MessageError(f"{name}: {error}") from None
 
 
-def scenes_of(content: bytes, name: str, label_map: LabelMap | None = None) -> dict[str, Reader]:
-    """Return the readers of all scenes in a file by the names of the scenes.
+def scenes_of(content: bytes, label_map: LabelMap | None = None) -> dict[str, Reader]:
+    """Return the readers of all scenes in the content of a file by the names of the scenes.
 
-    Args:
-        content: the content of the file.
-        name: name of the file. Only its suffix ``.jsonl`` counts.
-        label_map: labels of numeric class ids; see `read_label_map`.
+    ``label_map`` has the labels of numeric class ids; see `read_label_map`.
 
     Raises:
         MessageError: the content has an unknown format, or contains no objects.
     """
-    text = _text(content)
-    if (lines := _json_lines(name, text)) is not None:
-        return {
-            str(number): partial(_read_line, line, label_map)
-            for number, line in enumerate(lines, 1)
-            if line.strip()
-        }
-    return scenes_in(_parsed(text), label_map)
+    data = parsed(content)
+    if not isinstance(data, Parts):
+        return scenes_in(data, label_map)
+    if not data:
+        raise MessageError("the file contains no messages that can be decoded")
+    first = next(iter(data.values()))()
+    if are_records([first]):  # one object a line
+        return scenes_in([part() for part in data.values()], label_map)
+    topics = {name.rpartition(":")[0]: part for name, part in reversed(data.items())}
+    usable = [topic for topic, part in topics.items() if not topic or _has_scene(part)]
+    if not usable:
+        some = ", ".join(islice(topics, 5))
+        raise MessageError(f"this is a recording without detections; its topics are {some}")
+    names = {name: name.rpartition(":") for name in data}
+    return {
+        number if len(usable) == 1 else name: partial(_read_part, data[name], label_map)
+        for name, (topic, _, number) in names.items()
+        if topic in usable
+    }
 
 
-def _read_line(line: str, label_map: LabelMap | None) -> SceneFields:
-    return from_data(_parsed(line), label_map)
+def _read_part(part: Callable[[], Any], label_map: LabelMap | None) -> SceneFields:
+    return from_data(part(), label_map)
+
+
+def _has_scene(part: Callable[[], Any]) -> bool:
+    try:
+        return bool(scenes_in(part()))
+    except MessageError:
+        return False
+
+
+# ------------------------------------------------------------------------------ rooms of a home
 
 
 def rooms_from_file(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -115,7 +134,7 @@ def rooms_from_file(path: str | os.PathLike[str]) -> dict[str, Any]:
     name = os.fspath(path)
     content = _bytes(name)
     try:
-        return _rooms_in(_parsed(_text(content)), name)
+        return _rooms_in(json_value(text_of(content)), name)
     except MessageError as error:
         raise MessageError(f"{name}: {error}") from None
 
@@ -144,6 +163,9 @@ def _room(name: str, content: Any) -> Any:
     return {"id": name, **content} if isinstance(content, dict) else content
 
 
+# ----------------------------------------------------------------------------------- label maps
+
+
 def label_map_of(option: str) -> dict[str, str | None]:
     """Return the labels of the class ids that a name, or the name of a file, stands for.
 
@@ -152,44 +174,81 @@ def label_map_of(option: str) -> dict[str, str | None]:
     """
     if option in WELL_KNOWN:
         return read_label_map(option)
-    content = _bytes(option)
     try:
-        return labels_in(content.decode())
-    except ValueError:
-        raise MessageError(f"--label-map: {option} does not contain labels") from None
+        return labels_in(text_of(_bytes(option)))
+    except MessageError as error:
+        raise MessageError(f"--label-map: {option}: {error}") from None
 
 
 def labels_in(text: str) -> dict[str, str | None]:
-    """Return the labels of class ids in JSON, in YAML with `names:`, or of one label a line.
+    """Return the labels of class ids in a text; its syntax decides how to read it.
 
-    The name of a known list, such as coco80, stands for its labels.
+    The text has one label a line, or an id and a label a line; or it is JSON or YAML of a data set,
+    a model (`id2label`) or the parameters of a ROS node; or a label map of TensorFlow. The name of
+    a known list, such as coco80, stands for its labels.
 
     Raises:
         MessageError: the text does not contain labels.
     """
     try:
-        return read_label_map(text if text in WELL_KNOWN else _names(text))
+        return read_label_map(text if text in WELL_KNOWN else _names(text.removeprefix("\ufeff")))
+    except MessageError as error:
+        raise MessageError(f"the label map does not contain labels: {error}") from None
     except (LookupError, TypeError, ValueError, RecursionError):
         raise MessageError("the label map does not contain labels") from None
 
 
 def _names(text: str) -> Any:
-    try:
-        names: Any = json.loads(text)
-    except json.JSONDecodeError:
-        _, is_yaml, block = f"\n{text}".partition("\nnames:")
-        if not is_yaml:
-            return text.splitlines()
-        entries = re.findall(r"^[ \t]*(?:-|(\d+):)(.+)$", block, re.MULTILINE)
-        if inline := re.match(r"[ \t]*\[([^\]]*)\]", block):
-            entries = [("", name) for name in inline[1].split(",")]
+    if text.lstrip()[:1] in ("{", "["):
+        return _names_of(json_value(text))
+    if entries := re.findall(r"\bitem\s*\{([^{}]*)\}", text):  # of TensorFlow
         return {
-            key or n: name.strip().strip("'\"") for n, (key, name) in enumerate(entries)
-        } or None
-    names = names.get("categories", names) if isinstance(names, dict) else names
-    if isinstance(names, list) and isinstance(names[0], dict):
-        return {entry["id"]: entry["name"] for entry in names}
-    return names
+            _member(entry, "id"): _member(entry, "display_name") or _member(entry, "name")
+            for entry in entries
+        }
+    lines = [line.strip() for line in text.splitlines() if not line.lstrip().startswith("#")]
+    pairs = [re.fullmatch(r"(\d+|/[mgt]/\w+)[\s:,;]+(\S.*)", line) for line in filter(None, lines)]
+    if pairs and all(pairs):
+        return {pair[1]: _without_comment(pair[2]) for pair in pairs if pair}
+    if any(re.match(r"[\w/* -]+:(\s|$)|- |---", line) for line in lines):
+        found = [_names_of(value) for value in yaml_values(text)]
+        return next(filter(None, found), None)
+    return list(filter(None, lines))
+
+
+def _member(entry: str, name: str) -> str:
+    found = re.search(rf"\b{name}\s*:\s*[\"']?([^\"'\n]+)", entry)
+    return found[1].strip() if found else ""
+
+
+def _without_comment(label: str) -> str:
+    return re.sub(r"\s+#.*", "", label).strip("'\"")
+
+
+_NAMES: Final = (
+    *("names", "id2label", "label_map", "class_names", "class_labels", "labels", "classes"),
+    *("categories", "class_map", "label2id"),
+)
+
+
+def _names_of(value: Any, depth: int = 0) -> Any:
+    """Return the labels in data: a list, or a dictionary by class ids; None without labels."""
+    if isinstance(value, dict) and depth < 6:
+        named = [value[name] for name in _NAMES if name in value]
+        if not named and all(isinstance(label, str) for label in value.values()):
+            return value
+        if not named and all(type(number) is int for number in value.values()):
+            return {number: label for label, number in value.items()}  # from labels to ids
+        found = (_names_of(one, depth + 1) for one in named or value.values())
+        return next(filter(None, found), None)
+    if not isinstance(value, list) or not value:
+        return None
+    if isinstance(value[0], dict):
+        return {one.get("id", n): one["name"] for n, one in enumerate(value)}
+    return value
+
+
+# -------------------------------------------------------------------------------------- contents
 
 
 def _bytes(name: str) -> bytes:
@@ -205,91 +264,3 @@ def _bytes(name: str) -> bytes:
     if len(text) > MAX_FILE:
         raise MessageError(f"{name} is too large: it has more than {MAX_FILE} bytes")
     return text
-
-
-def _text(content: bytes) -> str:
-    if content.startswith((b"PK\x03\x04", b"\x1f\x8b")):  # ZIP and gzip
-        raise MessageError(_PACKED)
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise MessageError("this is not JSON and no other text in UTF-8") from None
-
-
-def _json_lines(name: str, text: str) -> list[str] | None:
-    """Return the lines of a file with one JSON value per line; None for other files."""
-    first, _, rest = text.lstrip().partition("\n")
-    if not rest.strip() or not first.rstrip().endswith(("}", "]")) or first[:1] not in "{[":
-        return [text] if name.endswith(".jsonl") else None
-    try:
-        json.loads(first)
-    except (ValueError, RecursionError):
-        return text.split("\n") if name.endswith(".jsonl") else None
-    return text.split("\n")
-
-
-def _parsed(text: str) -> Any:
-    start = text.lstrip()[:1]
-    if start == "<":
-        return _xml(text)
-    if start not in "{[":
-        lines = [line for line in re.split(r"\r?\n", text) if line.strip()]
-        if (table := _table(lines)) is not None:
-            return table
-        words = [line.split() for line in lines]
-        if all(len(line) >= 5 and all(map(_is_number, line)) for line in words):
-            return Lines(words)
-        if re.match(r"---\s|[\w.-]+:(\s|$)", text):
-            raise MessageError(_YAML)
-        labels = [label.strip() for line in lines for label in line.split(",") if label.strip()]
-        if labels and not re.search(r'[{}[\]":<]', text) and not any(map(_is_number, labels)):
-            return labels
-    try:
-        return json.loads(text)
-    except RecursionError:
-        raise MessageError("this is not JSON that can be read: its nesting is too deep") from None
-    except ValueError as error:
-        raise MessageError(f"this is not JSON, and no other known format: {error}") from None
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
-
-
-def _table(lines: list[str]) -> Table | None:
-    """Return the rows of a CSV file, or None if the first line does not name the columns."""
-    header = lines[0].lower()
-    delimiter = max(",;\t", key=header.count)
-    names = [name.strip().strip('"') for name in header.split(delimiter)]
-    if len(names) < 2 or not set(LABEL_COLUMNS) & set(names):
-        return None
-    if len(set(names)) < len(names):
-        raise MessageError("this is a table with two columns of the same name")
-    rows = csv.reader(lines[1:], delimiter=delimiter, strict=True)
-    try:
-        return Table(dict(zip(names, map(str.strip, row), strict=False)) for row in rows)
-    except csv.Error as error:
-        raise MessageError(f"this is not a table that can be read: {error}") from None
-
-
-def _xml(text: str) -> ElementTree.Element:
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise MessageError("this is XML with a document type, which this program does not read")
-    try:
-        # Expat bounds the expansion of entities, and a document type is refused above. Between two
-        # parts of the text, other threads run.
-        parser, step = ElementTree.XMLParser(), max(_PART, len(text) // 32)  # noqa: S314
-        for at in range(0, len(text), step):
-            parser.feed(text[at : at + step])
-        root = parser.close()
-    except ElementTree.ParseError as error:
-        raise MessageError(f"this is not XML that can be read: {error}") from None
-    if root.tag != "annotations":
-        raise MessageError(
-            f"this is XML with the root <{root.tag[:40]}>; only exports of CVAT are read"
-        )
-    return root

@@ -1,4 +1,4 @@
-"""Scenes from the data of files and messages: a table of formats, and requests as they are.
+"""Scenes from the data of files and messages: the formats of the table, and requests as they are.
 
     fields = from_data(json.loads(results[0].to_json()))  # Ultralytics
     answer = client.missing(**fields)
@@ -12,61 +12,29 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import islice
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, TypeVar
 
-from scene_client import image_formats, world_formats
-from scene_client.image_formats import Lines, Parts
 from scene_client.image_plane import left_pairs
+from scene_client.parsing import Xml
+from scene_client.records import (
+    FIELDS,
+    FORMATS,
+    LABEL_MAP,
+    RECORDS,
+    Form,
+    Record,
+    Rows,
+    read,
+    records_of,
+    signs,
+)
 from scene_client.ros_fields import REMEDY, LabelMap, MessageError, read_label_map, unwrapped
-from scene_client.sightings import Message
-from scene_client.vision_msgs import MAX_OBJECTS, SceneFields, from_message, is_message
-from scene_client.world_formats import Table
+from scene_client.schemas import Detection
+from scene_client.sightings import MAX_OBJECTS, SceneFields, to_fields
+from scene_client.special_formats import SPECIAL, rows_of
+from scene_client.vision_msgs import form_of, from_message
 
 T = TypeVar("T")
-
-
-class Format(NamedTuple):
-    """A format of files.
-
-    Attributes:
-        name: name in messages.
-        matches: function that returns whether data has this format.
-        read: function that converts the data of one scene.
-        parts: function that returns the data of each scene by its name.
-    """
-
-    name: str
-    matches: Callable[[Any], bool]
-    read: Callable[[Any], Message]
-    parts: Callable[[Any], Parts] = lambda data: {"": data}
-
-
-FORMATS: Final = (
-    Format("CVAT", image_formats.is_cvat, image_formats.read_cvat, image_formats.cvat_parts),
-    Format(
-        "CSV", lambda data: isinstance(data, Table), world_formats.read_table,
-        world_formats.table_parts,
-    ),
-    Format("YOLO", lambda data: isinstance(data, Lines), image_formats.read_yolo),
-    Format("COCO", image_formats.is_coco, image_formats.read_coco, image_formats.coco_parts),
-    Format(
-        "Label Studio", image_formats.is_label_studio, image_formats.read_label_studio,
-        image_formats.label_studio_parts,
-    ),
-    Format(
-        "Roboflow", image_formats.is_roboflow, image_formats.read_roboflow,
-        image_formats.roboflow_parts,
-    ),
-    Format(
-        "Ultralytics", image_formats.is_ultralytics, image_formats.read_ultralytics,
-        image_formats.ultralytics_parts,
-    ),
-    Format("AI2-THOR", world_formats.is_ai2thor, world_formats.read_ai2thor),
-    Format("Hydra", world_formats.is_hydra, world_formats.read_hydra, world_formats.hydra_parts),
-    Format("ScanNet", world_formats.is_scannet, world_formats.read_scannet),
-    Format("MoveIt", world_formats.is_moveit, world_formats.read_moveit),
-)  # fmt: skip
-
 
 Reader = Callable[[], SceneFields]
 """A function that converts one scene. It raises `MessageError`."""
@@ -97,15 +65,31 @@ def scenes_in(data: Any, label_map: LabelMap | None = None) -> dict[str, Reader]
         MessageError: the data has an unknown format, or contains no objects.
     """
     data = unwrapped(data)
-    if is_message(data):
-        return {"": partial(from_message, data, label_map)}
-    form = next((form for form in FORMATS if form.matches(data)), None)
+    form = data.form if isinstance(data, Rows) else None
+    if form in (None, RECORDS):
+        form = form_of(data)
+    if form is None and (path := _path_of_records(data)) is not None:
+        form = RECORDS | {"items": path}
+    if form is None and _is_label_map(data):
+        form = LABEL_MAP
     if form is None:
         return {"": partial(_with_labels, data, label_map)}
-    parts: Parts = _guarded(form.name, form.parts, data)
-    if not parts:
-        raise MessageError("the file contains no objects")
-    return {name: partial(_converted, form, part, label_map) for name, part in parts.items()}
+    if "use" in form:
+        raise MessageError(f"this is {form['name']}: {form['use']}")
+    name, whole = form["name"], data
+    if "is_solid" in form:
+        return {"": partial(from_message, data, label_map)}
+    if "code" in form:
+        data = _guarded(name, SPECIAL[form["code"]], data)
+    elif "columns" in form:
+        data = _guarded(name, partial(rows_of, form["columns"]), data)
+    scenes = _guarded(name, partial(records_of, form), data)
+    if not scenes:
+        raise MessageError(f"the file contains no objects; it looks like {name}")
+    return {
+        scene: partial(_converted, form, records, whole, label_map)
+        for scene, records in scenes.items()
+    }
 
 
 def chosen(scenes: Mapping[str, Reader], scene: object, file: str = "") -> Reader:
@@ -121,6 +105,8 @@ def chosen(scenes: Mapping[str, Reader], scene: object, file: str = "") -> Reade
     if scene is not None and str(scene) in scenes:
         return scenes[str(scene)]
     if [*scenes] == [""]:
+        if str(scene) == "1":
+            return scenes[""]
         raise MessageError(f"the file has one scene, and no scene {scene}")
     names = ", ".join(islice(scenes, 5)) + (", …" if len(scenes) > 5 else "")
     first = next(iter(scenes), "")
@@ -131,11 +117,41 @@ def chosen(scenes: Mapping[str, Reader], scene: object, file: str = "") -> Reade
     )
 
 
-def _converted(form: Format, part: Any, label_map: LabelMap | None) -> SceneFields:
-    message = _guarded(form.name, form.read, part)
-    fields = from_message(vars(message), label_map, viewpoint=message.viewpoint)
-    fields.notes = message.notes + fields.notes
-    return fields
+def _is_label_map(data: Any) -> bool:
+    return (
+        isinstance(data, dict)
+        and bool(data)
+        and all(str(key).isdecimal() and isinstance(label, str) for key, label in data.items())
+    )
+
+
+def _path_of_records(data: Any) -> str | None:
+    """Return the path of the only list of records in data, or None."""
+    if isinstance(data, Rows) or are_records(data):
+        return "[]"
+    members = data.items() if isinstance(data, dict) else ()
+    lists = [name for name, value in members if are_records(value)]
+    return f"{lists[0]}.[]" if len(lists) == 1 else None
+
+
+def are_records(data: Any) -> bool:
+    """Return whether data is a list of objects of a detector, and not those of a request."""
+    if not isinstance(data, list) or not data or not all(isinstance(one, dict) for one in data):
+        return False
+    first = Record(((None, data), (0, data[0])))
+    if first.first("label") is None or data[0].keys() <= _REQUESTED:
+        return False
+    # An object with a label can be one of a request, with a misspelt field.
+    shared = {"position", "confidence"} if "label" in data[0] else set()
+    names = {*FIELDS["position"], *FIELDS["score"], *(name for _, name in FIELDS["image"])} - shared
+    return any(first.take(name) is not None for name in names)
+
+
+def _converted(
+    form: Form, records: list[Record], data: Any, label_map: LabelMap | None
+) -> SceneFields:
+    seen = _guarded(form["name"], lambda records: read(form, records, data), records)
+    return to_fields(seen, read_label_map(label_map))
 
 
 def _guarded(name: str, read: Callable[[Any], T], data: Any) -> T:
@@ -156,6 +172,7 @@ _TRAINING: Final = frozenset(
     ("scene_id", "source", "group", "viewer_frame", "counts", "false_relations", "confirmed")
 )
 _TRAINING_OBJECT: Final = frozenset(("box2d", "count"))
+_REQUESTED: Final = _TRAINING_OBJECT | Detection.model_fields.keys()
 
 
 def _request(data: Any) -> dict[str, Any]:
@@ -164,10 +181,7 @@ def _request(data: Any) -> dict[str, Any]:
     ):
         return {"objects": data}
     if not isinstance(data, dict) or not isinstance(data.get("objects"), list):
-        raise MessageError(
-            f"{_kind(data)} is neither a request with a list of objects nor a known format; "
-            "docs/clients.md lists the formats"
-        )
+        raise MessageError(f"this is {_kind(data)}, and no known format{_nearest(data)}")
     things = [thing for thing in data["objects"] if isinstance(thing, dict)]
     is_training = _TRAINING & data.keys() or any(
         type(thing.get("id")) is int or _TRAINING_OBJECT & thing.keys() for thing in things
@@ -183,10 +197,23 @@ def _request(data: Any) -> dict[str, Any]:
 
 
 def _kind(data: Any) -> str:
-    if isinstance(data, dict):
-        names = ", ".join(str(name)[:40] for name in islice(data, 5))
-        return f"a JSON object with the fields {names}" if names else "an empty JSON object"
-    return "a JSON list" if isinstance(data, list) else "a JSON value"
+    if isinstance(data, Xml):
+        return f"XML with the root <{next(iter(data))[:40]}>"
+    is_list = isinstance(data, list)
+    one, kind = (data[0], "list of objects") if is_list and data else (data, "object")
+    if not isinstance(one, dict):
+        return "a JSON list" if is_list else "a JSON value"
+    names = ", ".join(str(name)[:24] for name in islice(one, 5))
+    return f"a JSON {kind} with the fields {names}" if names else f"an empty JSON {kind}"
+
+
+def _nearest(data: Any) -> str:
+    """Return the name of the format with the most paths in data, and a path that is missing."""
+    form = max(FORMATS, key=lambda form: signs(form, data))
+    if not signs(form, data):
+        return ": send a list of objects with the field label, or a format of docs/clients.md"
+    lacking = next(path for path in form["has"] if not signs({"has": [path]}, data))
+    return f"; the nearest is {form['name']}, which also has {lacking.partition('|')[0][:60]}"
 
 
 def _of_training(scene: Mapping[str, Any], things: list[dict[str, Any]]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ declare other conventions: the axis that points up, the unit of length, and the 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, Literal, NamedTuple
 
 Vector = tuple[float, float, float]
@@ -256,3 +256,44 @@ def _rotation(quaternion: Quaternion) -> Axes:
         (2 * (xy - zw), 1 - 2 * (xx + zz), 2 * (yz + xw)),
         (2 * (xz + yw), 2 * (yz - xw), 1 - 2 * (xx + yy)),
     )
+
+
+def quaternion_of(axes: Sequence[float]) -> Quaternion:
+    """Return the rotation whose rotated axes are the nine numbers: x, y and z, one after another.
+
+    Of a left-handed set, the third axis counts as the other way round: a box has the same sides.
+    """
+    a, b, c, d, e, f, g, h, i = axes
+    if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0:
+        g, h, i = -g, -h, -i
+    # The largest component comes from a square root, and the others from it (Shepperd, 1978).
+    squares = (1 + a - e - i, 1 - a + e - i, 1 - a - e + i, 1 + a + e + i)
+    largest = max(range(4), key=squares.__getitem__)
+    root = 2 * math.sqrt(max(squares[largest], 1e-12))
+    table = (
+        (root * root / 4, b + d, c + g, f - h),
+        (b + d, root * root / 4, f + h, g - c),
+        (c + g, f + h, root * root / 4, b - d),
+        (f - h, g - c, b - d, root * root / 4),
+    )
+    x, y, z, w = (value / root for value in table[largest])
+    return x, y, z, w
+
+
+def product(a: Quaternion, b: Quaternion) -> Quaternion:
+    """Return the rotation by b and then by a."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return (
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+def rotated(vector: Sequence[float], turn: Quaternion) -> Vector:
+    """Return a rotated vector."""
+    x, y, z, w = turn
+    a, b, c, _ = product(product(turn, (vector[0], vector[1], vector[2], 0.0)), (-x, -y, -z, w))
+    return a, b, c

@@ -11,7 +11,7 @@ of each class id; `read_label_map` lists its forms.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from numbers import Real
 from typing import Any, Final, TypeAlias
 
@@ -32,6 +32,16 @@ def take(message: Any, *path: str) -> Any:
         else:
             message = getattr(message, name, None)
     return message
+
+
+def members(message: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the names and values of the fields of a message; nothing for other data."""
+    if isinstance(message, Mapping):
+        yield from ((name, value) for name, value in message.items() if isinstance(name, str))
+        return
+    names: Any = getattr(message, "get_fields_and_field_types", dict)()  # of rclpy
+    for name in names or getattr(message, "__slots__", ()) or getattr(message, "__dict__", ()):
+        yield name, getattr(message, name, None)
 
 
 def has(message: Any, name: str) -> bool:
@@ -98,7 +108,7 @@ def frame_of(header: Any) -> str:
 
 def time_of(stamp: Any) -> dict[str, int] | None:
     """Convert a time of ROS 1 or ROS 2 to the field `stamp`. Return None for an invalid time."""
-    for names in (("sec", "nanosec"), ("secs", "nsecs")):
+    for names in (("sec", "nanosec"), ("secs", "nsecs"), ("sec", "nsec")):
         seconds, nanoseconds = (integer(take(stamp, name)) for name in names)
         if seconds is not None and nanoseconds is not None:
             is_valid = -(2**31) <= seconds < 2**31 and 0 <= nanoseconds < 1_000_000_000
@@ -110,52 +120,6 @@ def unwrapped(message: Any) -> Any:
     """Return a ROS message without the envelope that rosbridge adds."""
     inner = message.get("msg") if isinstance(message, Mapping) else None
     return inner if isinstance(inner, Mapping) else message
-
-
-def as_vision_msgs(message: Any) -> Any:
-    """Return a DetectionArray of yolo_ros in the layout of vision_msgs; other messages unchanged.
-
-    If a detection has a 3D box, the boxes and their frame come from `bbox3d`. Otherwise, the boxes
-    are those in the image.
-    """
-    entries = take(message, "detections")
-    if not isinstance(entries, list | tuple) or not any(has(one, "class_name") for one in entries):
-        return message
-    solids = [take(entry, "bbox3d") for entry in entries]
-    frames = [frame_of(solid) for solid in solids]
-    header = take(message, "header")
-    if not any(any((numbers(take(solid, "size"), "xyz") or {}).values()) for solid in solids):
-        boxes, frames = [_image_box(take(entry, "bbox")) for entry in entries], [""] * len(entries)
-    else:
-        boxes = solids
-    return {
-        "header": {
-            "frame_id": next(filter(None, frames), frame_of(header)),
-            "stamp": take(header, "stamp"),
-        },
-        "detections": [
-            {
-                "header": {"frame_id": frame},
-                "id": take(entry, "id"),
-                "results": [
-                    {
-                        "class_id": text(take(entry, "class_name")) or take(entry, "class_id"),
-                        "score": take(entry, "score"),
-                    }
-                ],
-                "bbox": box,
-            }
-            for entry, box, frame in zip(entries, boxes, frames, strict=True)
-        ],
-    }
-
-
-def _image_box(box: Any) -> dict[str, Any]:
-    return {
-        "center": take(box, "center"),
-        "size_x": take(box, "size", "x"),
-        "size_y": take(box, "size", "y"),
-    }
 
 
 # -------------------------------------------------------------------------------- class ids

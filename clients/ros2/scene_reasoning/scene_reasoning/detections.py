@@ -7,12 +7,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from scene_client.frames import Conventions, is_optical, is_world_fixed
+from scene_client.frames import (
+    Conventions,
+    Quaternion,
+    Vector,
+    is_optical,
+    is_world_fixed,
+    product,
+    rotated,
+)
 from scene_client.ros_fields import LabelMap, read_label_map
 from scene_client.vision_msgs import from_message
 
-Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]  # x, y, z, w
 Pose = tuple[float, float, float]  # x and y in metres, yaw in radians
 
 # Rotations to body axes, from an optical frame and from a frame whose y axis points up.
@@ -98,21 +104,3 @@ class Converter:
         )
         thing["position"] = tuple(a + b for a, b in zip(place, transform.translation, strict=True))
         return thing | ({"yaw": yaw} if size is None else {"yaw": yaw, "size": size})
-
-
-def product(a: Quaternion, b: Quaternion) -> Quaternion:
-    """Return the rotation `b`, then `a`."""
-    ax, ay, az, aw = a
-    bx, by, bz, bw = b
-    return (
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-        aw * bw - ax * bx - ay * by - az * bz,
-    )
-
-
-def rotated(vector: Vector, turn: Quaternion) -> Vector:
-    """Return a rotated vector."""
-    x, y, z, w = turn
-    return product(product(turn, (*vector, 0.0)), (-x, -y, -z, w))[:3]

@@ -1,0 +1,361 @@
+"""Parsing of files: the bytes of JSON, YAML, XML, MCAP, tables and lists become data."""
+
+from __future__ import annotations
+
+import ast
+import csv
+import io
+import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from importlib import import_module
+from typing import Any, Final
+from xml.etree import ElementTree
+
+from scene_client.records import FIELDS, TABLE, Form, Rows, key_of
+from scene_client.ros_fields import MessageError
+
+_MOST_YAML: Final = 2**19  # bytes; PyYAML is slow
+_MOST_MESSAGES: Final = 2**26  # bytes of the messages in a file, after decompression
+_PART: Final = 2**16  # characters of XML
+_START: Final = 2000  # characters in which a refused format shows
+_BEFORE: Final = r"\s*(?:<\?xml[^>]*>\s*)?(?:<!--(?:(?!-->).)*-->\s*)?"
+_NUMBER: Final = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
+_FENCE: Final = re.compile(r"```(?:\w+)?[ \t]*\n(.*?)```", re.DOTALL)
+_ITEM: Final = re.compile(r"(?:[-*•+]|\d{1,3}[.)])[ \t]+(?=\S)")
+_YAML: Final = re.compile(r"(---\s|- |[\w./ -]{1,64}:(\s|$))")
+
+
+def parsed(content: bytes) -> Any:
+    """Return the data of a file: a JSON value, `Rows`, a list of labels, an `Xml`, or `Parts`.
+
+    Raises:
+        MessageError: the content is not text, or has an unknown format.
+    """
+    _refuse(content[:_START].decode("latin-1").removeprefix("\u00ef\u00bb\u00bf"))
+    if content.startswith(b"\x89MCAP"):
+        return _messages(content)
+    return _data(text_of(content))
+
+
+class Parts(dict[str, Callable[[], Any]]):
+    """Functions that return the data of each scene: a line, a document, or a message."""
+
+
+class Xml(dict[str, Any]):
+    """The root of a file in XML, by its name."""
+
+
+def text_of(content: bytes) -> str:
+    """Return the text of a file in UTF-8, or in UTF-16 with a mark of its byte order.
+
+    Raises:
+        MessageError: the content is not text.
+    """
+    is_wide = content.startswith((b"\xff\xfe", b"\xfe\xff"))
+    try:
+        return content.decode("utf-16" if is_wide else "utf-8-sig")
+    except UnicodeDecodeError:
+        raise MessageError("this is no text in UTF-8, and no other known format") from None
+
+
+def _refuse(start: str) -> None:
+    for form in TABLE["refused"]:
+        if re.match(rf"{_BEFORE}(?:{form['match']})", start, re.IGNORECASE | re.DOTALL):
+            raise MessageError(f"this is {form['name']}: {form['use']}")
+
+
+def _data(text: str) -> Any:
+    if (fence := _FENCE.search(text)) is not None:  # of a language model
+        text = fence[1]
+    start = text.lstrip()[:1]
+    if start == "<":
+        return _xml(text)
+    if start in ("{", "["):
+        return _json(text)
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    if not lines:
+        raise MessageError("the file is empty")
+    for parse in (_table, _numbers, _lines, _labels):
+        if (data := parse(lines)) is not None:
+            return data
+    if _YAML.match(text):
+        return _yaml(text)
+    raise MessageError(_what_text(lines))
+
+
+def _json(text: str) -> Any:
+    first, _, rest = text.strip().partition("\n")
+    if rest.strip() and first.rstrip().endswith(("}", "]")):
+        try:
+            json.loads(first)
+        except (ValueError, RecursionError):
+            pass
+        else:
+            lines = enumerate(text.split("\n"), 1)
+            return Parts({str(n): partial(json_value, line) for n, line in lines if line.strip()})
+    return json_value(text)
+
+
+def json_value(text: str) -> Any:
+    """Return the value of a text in JSON.
+
+    Raises:
+        MessageError: the text is not JSON.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise MessageError("this is not JSON that can be read: its nesting is too deep") from None
+    except json.JSONDecodeError as error:
+        where = f"line {error.lineno}, column {error.colno}"
+        end = "; the file ends too early" if error.pos >= len(text.rstrip()) - 1 else ""
+        raise MessageError(f"this is not JSON that can be read: see {where}{end}") from None
+    except ValueError:
+        raise MessageError("this is not JSON that can be read: a number is too long") from None
+
+
+# ------------------------------------------------------------------------------------ lines
+
+
+def _table(lines: list[str]) -> Rows | None:
+    """Return the rows of a table, or None if the first line does not name the columns."""
+    delimiter = max(",;\t|", key=lines[0].count)
+    names = [name.strip().strip('"') for name in lines[0].split(delimiter)]
+    keys = [key_of(name) for name in names]
+    if len(names) < 2 or not set(FIELDS["label"]) & {*keys} or any(map(_is_number, names)):
+        return None
+    if len({*keys} - {""}) < sum(map(bool, keys)):
+        raise MessageError("this is a table with two columns of the same name")
+    # A comma in a number of such a table is a decimal point.
+    has_commas = delimiter != ","
+    rows = csv.reader(lines[1:], delimiter=delimiter, strict=True)
+    try:
+        return Rows(
+            (
+                {name: _cell(cell, has_commas) for name, cell in zip(names, row, strict=False)}
+                for row in rows
+            ),
+            first=2,
+        )
+    except csv.Error as error:
+        raise MessageError(f"this is not a table that can be read: {error}") from None
+
+
+def _cell(cell: str, has_commas: bool) -> Any:
+    cell = cell.strip()
+    if has_commas and re.fullmatch(r"[+-]?\d+,\d+", cell):
+        return cell.replace(",", ".")
+    if cell.startswith(("[{", "{")) and len(cell) < _START * 32:
+        for load in (json.loads, ast.literal_eval):  # a dictionary of Python has other quotes
+            try:
+                return load(cell)
+            except (ValueError, SyntaxError, RecursionError, MemoryError):
+                continue
+    return cell
+
+
+def _numbers(lines: list[str]) -> Rows | None:
+    """Return the rows of a file of YOLO: class, box, score and track; or class and outline."""
+    words = [line.split() for line in lines]
+    if not all(len(line) >= 5 and all(map(_is_number, line)) for line in words):
+        return None
+    return Rows(map(_yolo, words))
+
+
+def _yolo(words: list[str]) -> dict[str, Any]:
+    label, values = words[0], [float(word) for word in words[1:]]
+    track = ""
+    if len(values) == 6 and values[5].is_integer() and max(values[:5]) <= 1:
+        track = words.pop()
+        values.pop()
+    score = values.pop() if len(values) % 2 else 1.0
+    box = {"xcenter": 0, "ycenter": 1, "width": 2, "height": 3}
+    shape = {n: values[at] for n, at in box.items()} if len(values) == 4 else {"points": values}
+    return {"class_id": label, "score": score, "track_id": track, **shape}
+
+
+def _lines(lines: list[str]) -> Rows | None:
+    """Return the rows of lines in one of the formats of the table."""
+    for form in TABLE["lines"]:
+        if "match" in form:
+            kept = [line for line in lines if not re.fullmatch(form["drop"], line)]
+            found = [re.fullmatch(form["match"], line) for line in kept]
+            rows = [one.groupdict() for one in found if one]
+        else:
+            names = form["words"].split()
+            rows = [row for line in lines if (row := _row(line.split(), names, form)) is not None]
+            kept = lines
+        if rows and len(rows) == len(kept):
+            return Rows(rows, form if "position" in form else TABLE["records"])
+    return None
+
+
+def _row(words: list[str], names: list[str], form: Form) -> dict[str, str] | None:
+    """Return the fields of a line: a label, which may have several words, and numbers."""
+    count = next((n for n, word in enumerate(words) if _is_number(word)), len(words))
+    numbers = words[count:]
+    if not count or not form["least"] <= 1 + len(numbers) <= len(names):
+        return None
+    if not all(map(_is_number, numbers)):
+        return None
+    return dict(zip(names, [" ".join(words[:count]), *numbers], strict=False))
+
+
+def _labels(lines: list[str]) -> list[str] | None:
+    """Return the labels of a list or a caption: one a line, or with separators between them."""
+    if len(lines) == 1:
+        separators = (" | ", " . ", ",")
+        separator = max(separators, key=lines[0].count)
+        labels = lines[0].rstrip(" .").split(separator)
+    elif all(map(_ITEM.match, lines)):
+        labels = [_ITEM.sub("", line, count=1) for line in lines]
+    else:
+        labels = [label for line in lines for label in line.split(",")]
+    labels = [label.strip() for label in labels if label.strip()]
+    if any(map(_is_no_label, labels)):
+        return None
+    return labels
+
+
+def _is_no_label(label: str) -> bool:
+    """Return whether a text has marks of data, or a number as a word of its own."""
+    return bool(re.search(r'[{}\[\]":<=]', label)) or any(
+        _is_number(word.strip("()%,;")) for word in label.split()
+    )
+
+
+def _is_number(word: str) -> bool:
+    return _NUMBER.fullmatch(word) is not None or word.lower() in ("nan", "inf", "-inf")
+
+
+def _what_text(lines: list[str]) -> str:
+    cells = re.split(r"[,;\t]", lines[0])
+    if len(cells) > 2 and any(map(_is_number, map(str.strip, cells))):
+        return "this is a table without a header: name its columns, such as label,x,y,z"
+    start = lines[0][:60]
+    return (
+        f"this is text of no known format, which starts with {start!r}: send JSON, a table with "
+        "the column label, or one label a line"
+    )
+
+
+# ------------------------------------------------------------------------- YAML, XML and MCAP
+
+
+def extra(module: str) -> Any:
+    """Return a module of the extra ``files``.
+
+    Raises:
+        MessageError: the module is not installed.
+    """
+    try:
+        return import_module(module)
+    except ImportError:
+        package, remedy = module.partition(".")[0], "pip install 'scene-client[files]'"
+        raise MessageError(f"this format needs the package {package}: {remedy}") from None
+
+
+def _yaml(text: str) -> Any:
+    if len(text) > _MOST_YAML:
+        raise MessageError(f"this is YAML of more than {_MOST_YAML} characters: convert it to JSON")
+    values = [value for value in yaml_values(text) if value is not None]
+    if len(values) == 1:
+        return values[0]
+    return Parts({str(n): partial(dict, value) for n, value in enumerate(values, 1)})
+
+
+def yaml_values(text: str) -> list[Any]:
+    """Return the documents of a text in YAML, as `ros2 topic echo` prints them.
+
+    Raises:
+        MessageError: the text is not YAML, or has anchors, or PyYAML is not installed.
+    """
+    yaml = extra("yaml")
+    try:
+        # An alias stands for a part of the document again. A small text could mean a huge value.
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
+            raise MessageError("this is YAML with aliases (*), which this program does not read")
+        return [*yaml.safe_load_all(text)]
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        if isinstance(error, MessageError):
+            raise
+        mark = getattr(error, "problem_mark", None)
+        where = f": see line {mark.line + 1}" if mark else ""
+        raise MessageError(f"this is not YAML that can be read{where}") from None
+
+
+def _xml(text: str) -> Any:
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise MessageError("this is XML with a document type, which this program does not read")
+    try:
+        # Expat bounds the expansion of entities, and a document type is refused above. Between two
+        # parts of the text, other threads run.
+        parser, step = ElementTree.XMLParser(), max(_PART, len(text) // 32)  # noqa: S314
+        for at in range(0, len(text), step):
+            parser.feed(text[at : at + step])
+        root = parser.close()
+    except ElementTree.ParseError as error:
+        line = error.position[0]
+        raise MessageError(f"this is not XML that can be read: see line {line}") from None
+    return Xml({root.tag: _element(root)})
+
+
+def _element(element: ElementTree.Element) -> Any:
+    """Return the attributes and children of an element; its text if it has neither."""
+    if not len(element) and not element.attrib:
+        return (element.text or "").strip()
+    value: dict[str, Any] = dict(element.attrib)
+    for child in element:
+        inner = _element(child)
+        if child.tag not in value:
+            value[child.tag] = inner
+        elif isinstance(value[child.tag], list):
+            value[child.tag].append(inner)
+        else:
+            value[child.tag] = [value[child.tag], inner]
+    return value
+
+
+def _messages(content: bytes) -> Parts:
+    """Return the messages of a recording (MCAP) by topic and number: of ROS 2, or in JSON."""
+    reader, kinds = extra("mcap.stream_reader"), extra("mcap.records")
+    factory = extra("mcap_ros2.decoder").DecoderFactory()
+    schemas, channels, parts = {}, {}, Parts()
+    try:
+        stream = reader.StreamReader(io.BytesIO(content), emit_chunks=True)
+        for outer in stream.records:
+            chunk = _unpacked(outer) if isinstance(outer, kinds.Chunk) else None
+            for record in reader.breakup_chunk(chunk) if chunk else (outer,):
+                if isinstance(record, kinds.Schema):
+                    schemas[record.id] = record
+                elif isinstance(record, kinds.Channel):
+                    channels[record.id] = record
+                elif isinstance(record, kinds.Message):
+                    channel = channels[record.channel_id]
+                    schema, coding = schemas.get(channel.schema_id), channel.message_encoding
+                    decode = json.loads if coding == "json" else factory.decoder_for(coding, schema)
+                    if decode is not None:
+                        count = sum(1 for name in parts if name.startswith(f"{channel.topic}:"))
+                        parts[f"{channel.topic}:{count + 1}"] = partial(decode, record.data)
+    except MessageError:
+        raise
+    except Exception:  # noqa: BLE001 — of any of three libraries
+        raise MessageError("this is a recording (MCAP) that is damaged or ends too early") from None
+    return parts
+
+
+def _unpacked(chunk: Any) -> Any:
+    """Return a chunk of a recording with the data as they are, which have a limit."""
+    if chunk.compression == "zstd":
+        stream = extra("zstandard").ZstdDecompressor().stream_reader(chunk.data)
+        data = stream.read(_MOST_MESSAGES + 1)
+    elif chunk.compression == "lz4":
+        data = extra("lz4.frame").LZ4FrameDecompressor().decompress(chunk.data, _MOST_MESSAGES + 1)
+    else:
+        data = chunk.data
+    if len(data) > _MOST_MESSAGES:
+        raise MessageError(f"this is a recording with a chunk of more than {_MOST_MESSAGES} bytes")
+    return replace(chunk, data=data, compression="")

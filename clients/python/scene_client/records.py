@@ -1,0 +1,605 @@
+"""The reader of all formats in the table ``formats.json``: where labels, scores and boxes lie.
+
+A format has a name, paths that its data has (`has`), the path of its objects (`items`), and the
+paths of their fields. A path consists of steps with dots between them:
+
+    name    a member; a number is the index of an element
+    []      each element of a list (other data counts as a list of one)
+    *       each member; in the path of a field, the first one
+    ^       at the start: the object one [] or * further out; /: the whole data
+    @       the key of the object; within a path, the member with this key
+    ~       the first key
+    ?k=a+b  the first element whose member k is a or b; >k: the element with the largest member k
+
+"a|b" is the first path that leads to a value, and "x,y,z" are several values. The names in `fields`
+find the fields that a format does not name. So one reader also reads tables and lists of records.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping
+from functools import cached_property, lru_cache
+from importlib.resources import files
+from typing import Any, Final
+
+from scene_client.frames import Conventions, quaternion_of
+from scene_client.image_plane import Box, upright_box
+from scene_client.ros_fields import MessageError, frame_of, members, number, take, text, time_of
+from scene_client.sightings import Note, Reason, Seen, Sighting, Solid
+
+Chain = tuple[tuple[Any, Any], ...]
+"""Pairs (key, node): the whole data, then the objects of each [] or * of a path."""
+
+Form = dict[str, Any]
+"""An entry of the table of formats."""
+
+TABLE: Final = json.loads(files("scene_client").joinpath("formats.json").read_text("utf-8"))
+FORMATS: Final[list[Form]] = TABLE["formats"]
+RECORDS: Final[Form] = TABLE["records"]
+"""The format of a list of records, whose fields are found by their names."""
+LABEL_MAP: Final[Form] = FORMATS[-1]
+"""The format of a list of class names, which is no scene."""
+FIELDS: Final[dict[str, Any]] = TABLE["fields"]
+"""Usual names of each kind of field, in the form of `key_of`."""
+
+_CARRIES: Final = re.compile(FIELDS["carries"])
+_NUMBER: Final = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
+_NONE: Final = frozenset(("", "nan", "null", "none", "n/a"))
+_MOST_NAMES: Final = 8  # of unread fields in a note
+_LOOKED_AT: Final = 64  # number of records whose fields are looked through
+_TURN: Final = 6.3  # radians; a larger yaw is in degrees
+_IMAGE: Final = ("corners", "rows", "corner", "centre", "points", "spans", "radii")
+_SOLID: Final = ("position", "size", "turn", "axes", "matrix", "span", "yaw", "degrees", "about")
+
+
+class Rows(list[dict[str, Any]]):
+    """Rows of a table. ``form`` is their format, and ``first`` the number of the first line."""
+
+    def __init__(self, rows: Any, form: Form = RECORDS, first: int = 1) -> None:
+        super().__init__(rows)
+        self.form, self.first = form, first
+
+
+# ---------------------------------------------------------------------------------------- paths
+
+
+@lru_cache(maxsize=1024)
+def _paths(path: str) -> list[list[str]]:
+    return [one.split(".") if one else [] for one in path.split("|")]
+
+
+def each(data: Any, path: str) -> Iterator[Chain]:
+    """Yield the objects of data at the first path of "a|b" that leads to one."""
+    for steps in _paths(path):
+        found = _each(((None, data),), data, steps)
+        if (first := next(found, None)) is not None:
+            yield first
+            yield from found
+            return
+
+
+def _each(chain: Chain, node: Any, steps: list[str]) -> Iterator[Chain]:
+    entries: Any
+    for place, step in enumerate(steps):
+        if step == "[]":
+            is_list = isinstance(node, list | tuple)
+            entries = enumerate(node) if is_list else () if node is None else ((0, node),)
+        elif step == "*":
+            entries = node.items() if isinstance(node, Mapping) else ()
+        else:
+            node = _step(node, step)
+            continue
+        for entry in entries:
+            yield from _each((*chain, entry), entry[1], steps[place + 1 :])
+        return
+    if node is not None:
+        yield chain if node is chain[-1][1] else (*chain, (None, node))
+
+
+def get(chain: Chain, path: str) -> Any:
+    """Return the value at the first path of "a|b" that leads to one, or None."""
+    for steps in _paths(path):
+        first = steps[0] if steps else ""
+        outer = len(chain) if first[:1] == "/" else 1 + first.count("^")
+        key, node = chain[-min(outer, len(chain))]
+        if steps[-1:] == ["@"]:
+            return key
+        for place, step in enumerate(steps):
+            step = step.lstrip("^/")
+            if step == "[]":
+                entries = node if isinstance(node, list | tuple) else ()
+                rest = ".".join(steps[place + 1 :])
+                return [get(((None, entry),), rest) for entry in entries]
+            node = _step(node, str(chain[-1][0]) if step == "@" else step)
+            if node is None:
+                break
+        if node is not None and node != "":
+            return node
+    return None
+
+
+def _step(node: Any, step: str) -> Any:
+    """Return the part of a node that a step leads to, or None."""
+    if step[:1] == ">":
+        if not isinstance(node, list | tuple):
+            raise MessageError(f"the {step[1:]}s must be in a list")
+        ranks = {n: number(_scored(one, step[1:])) for n, one in enumerate(node)}
+        finite = {n: rank for n, rank in ranks.items() if rank is not None}
+        return node[max(finite, key=finite.__getitem__)] if finite else None
+    if step[:1] == "?":
+        name, _, wanted = step[1:].partition("=")
+        entries = node if isinstance(node, list | tuple) else ()
+        return next((one for one in entries if str(take(one, name)) in wanted.split("+")), None)
+    if step in ("*", "~"):
+        pairs = node.items() if isinstance(node, Mapping) else ()
+        return next((pair[step == "*"] for pair in pairs), None)
+    if isinstance(node, list | tuple):
+        return node[int(step)] if step.isdecimal() and int(step) < len(node) else None
+    return take(node, step) if step else node
+
+
+def _scored(result: Any, name: str) -> Any:
+    """Return a member of a result of vision_msgs, whose layout differs between versions of ROS."""
+    return take(take(result, "hypothesis") or result, name)
+
+
+def signs(form: Form, data: Any) -> float:
+    """Return which part of the paths in `has` leads to a value. A path may end in "=value"."""
+    paths, found = form.get("has", ()), 0
+    for path in paths:
+        path, _, wanted = path.partition("=")
+        chain = next(each(data, path), None)
+        found += chain is not None and (not wanted or str(chain[-1][1]) == wanted)
+    return found / len(paths) if paths else 0.0
+
+
+def spot(chain: Chain, spec: Any) -> Any:
+    """Return the value that a format describes: paths, "x,y,z", or a path and a pattern."""
+    if isinstance(spec, list):
+        return next((value for one in spec if (value := spot(chain, one)) is not None), None)
+    if isinstance(spec, dict):
+        value = get(chain, spec["path"])
+        if "match" not in spec or not isinstance(value, str):
+            return value
+        found = re.search(spec["match"], value)
+        return found[1] if found else None
+    if "," not in spec:
+        return get(chain, spec) if spec else None
+    values = [get(chain, one) for one in spec.split(",")]
+    return None if any(value is None for value in values) else values
+
+
+# --------------------------------------------------------------------------------------- fields
+
+
+def key_of(name: str) -> str:
+    """Return the name of a field without capitals and separators."""
+    return re.sub(r"[\W_]", "", name).lower()
+
+
+class Record:
+    """An object of a file: its chain, and its fields by `key_of` their names.
+
+    Attributes:
+        used: names of the fields that the reader has taken.
+    """
+
+    def __init__(self, chain: Chain) -> None:
+        self.chain = chain
+        self.node = chain[-1][1]
+        self.used: set[str] = set()
+
+    @cached_property
+    def fields(self) -> dict[str, tuple[str, Any]]:
+        """Pairs (name, value), also of the members of boxes and poses, by the keys of the names."""
+        fields: dict[str, tuple[str, Any]] = {}
+        nodes = [("", self.node, 0)]
+        for owner, node, depth in nodes:
+            for name, value in members(node):
+                key = key_of(name)
+                fields.setdefault(key, (owner + name, value))
+                if key in FIELDS["inside"] and depth < 3 and not isinstance(value, list | str):
+                    nodes.append((f"{owner}{name}.", value, depth + 1))
+        return fields
+
+    def take(self, names: str) -> Any:
+        """Return the value of a field, or those of "x,y,z"; None if one is missing."""
+        pairs = [self.fields.get(name, ("", None)) for name in names.split(",")]
+        if any(value is None or value == "" for _, value in pairs):
+            return None
+        self.used.update(name for name, _ in pairs)
+        return [value for _, value in pairs] if "," in names else pairs[0][1]
+
+    def first(self, kind: str) -> Any:
+        """Return the first value of the fields of a kind, or None."""
+        return next((v for n in FIELDS[kind] if (v := self.take(n)) is not None), None)
+
+    def forget(self, names: str) -> None:
+        """Count fields as not taken."""
+        self.used -= {self.fields[name][0] for name in names.split(",") if name in self.fields}
+
+    def unread(self) -> Iterator[str]:
+        """Yield the names of the fields that carry a box, a score, a frame or a time, unread."""
+        for key, (name, value) in self.fields.items():
+            is_empty = value is None or value == "" or value == [] or value == {}
+            is_used = any(one == name or one.startswith(f"{name}.") for one in self.used)
+            if not (is_empty or is_used or "." in name) and _CARRIES.search(key):
+                yield name
+
+
+def numeric(value: Any, what: str) -> float:
+    """Return a number, also of text; NaN for other values.
+
+    Raises:
+        MessageError: the value is text without a number.
+    """
+    if isinstance(value, str):
+        value = value.strip()
+        if _NUMBER.fullmatch(value):
+            return float(value)
+        if value.lower() not in _NONE:
+            raise MessageError(f"{what}: {value[:40]!r} is not a number")
+    return math.nan if (found := number(value)) is None else found
+
+
+def numerics(value: Any, what: str) -> list[float]:
+    """Return the numbers of a list, of nested lists, of "x,y;x,y", or of the members x, y, z, w."""
+    if isinstance(value, str) and "," in value:
+        value = value.replace(";", ",").split(",")
+    if hasattr(value, "tolist"):  # an array of numpy or of the standard library
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [part for one in value for part in numerics(one, what)]
+    if value is None or isinstance(value, str | float | int):
+        return [numeric(value, what)]
+    axes = [(axis, take(value, axis)) for axis in "xyzw"]
+    return [numeric(part, what) for axis, part in axes if axis in "xy" or part is not None]
+
+
+# ---------------------------------------------------------------------------------------- boxes
+
+
+def image(kind: str, values: Any, what: str, theta: float = 0.0) -> Box | None:
+    """Return the upright box around a box in an image that is rotated by ``theta`` radians."""
+    if kind == "spans":
+        xs, ys = (numerics(one, what) for one in values)
+    else:
+        several = numerics(values, what)
+        xs, ys = several[::2], several[1::2]
+        if kind == "rows":  # y before x
+            xs, ys = ys, xs
+        if kind != "points" and len(several) != 4:
+            return None
+    if not xs or not all(map(math.isfinite, xs + ys)):
+        return math.nan, math.nan, math.nan, math.nan
+    if kind in ("corner", "centre", "radii"):
+        (x, width), (y, height) = xs, ys
+        if kind == "radii":
+            width, height = 2 * width, 2 * height
+        if kind == "corner":  # the rotation is about the corner
+            cos, sin = math.cos(theta) / 2, math.sin(theta) / 2
+            x, y = x + cos * width - sin * height, y + sin * width + cos * height
+    else:
+        x, y, width, height = sum(_span(xs)) / 2, sum(_span(ys)) / 2, _side(xs), _side(ys)
+    return upright_box((x, y), (width, height), theta)
+
+
+def _span(values: list[float]) -> tuple[float, float]:
+    return min(values), max(values)
+
+
+def _side(values: list[float]) -> float:
+    return max(values) - min(values)
+
+
+def solid(form: Form, values: Mapping[str, Any], what: str) -> Solid | None:
+    """Return a box with a position, with z up if the format has another convention."""
+    parts = {name: numerics(value, what) for name, value in values.items()}
+    if len(matrix := parts.get("matrix", [])) == 16:  # the columns, one after another
+        parts |= {"position": matrix[12:15], "axes": matrix[0:3] + matrix[4:7] + matrix[8:11]}
+    if len(axes := parts.get("axes", [])) == 9:
+        parts["turn"] = [*quaternion_of(axes)]
+    if (span := parts.get("span")) and all(map(math.isfinite, span)):
+        sides = [_side(span[axis::3]) for axis in range(3)]
+        parts |= {"size": sides} if any(sides) else {}
+    if "about" in parts:  # the y axis
+        half = parts["about"][0] / 2
+        parts["turn"] = [0.0, math.sin(half), 0.0, math.cos(half)]
+    if len(position := parts.get("position", [])) in (1, 2):  # a member is missing
+        position = [math.nan] * 3
+    size, turn = (_of_length(parts.get(name), n) for name, n in (("size", 3), ("turn", 4)))
+    yaw = [*map(math.radians, parts.get("degrees", ())), *parts.get("yaw", ()), None][0]
+    if len(position) != 3:
+        return None
+    if "up" not in form or not all(map(math.isfinite, position)):
+        return Solid(position, size, turn, yaw)
+    x, y, z = position
+    up = form["up"]
+    if up == "unity":  # a left-handed frame, whose z axis points the other way
+        up, z, yaw = "y", -z, None if yaw is None else -yaw
+    order, origin = form.get("order", "xyzw"), form.get("origin", "centre")
+    conventions = Conventions(up, box_origin=origin, quaternion_order=order)
+    try:
+        box = conventions.box((x, y, z), size, None if yaw is not None else turn, yaw)
+    except ValueError:  # no rotation
+        box = conventions.box((x, y, z), size)
+    return Solid(box[0] or position, box[1], None, box[2])
+
+
+def _of_length(values: list[float] | None, length: int) -> Any:
+    return tuple(values) if values and len(values) == length else None
+
+
+# --------------------------------------------------------------------------------------- scenes
+
+
+def records_of(form: Form, data: Any) -> dict[str, list[Record]]:
+    """Return the records of each scene of data by the names of the scenes."""
+    items = form.get("items", "[]")
+    paths = [items] if isinstance(items, str) else items
+    records = [Record(chain) for path in paths for chain in each(data, path)]
+    if "inner" in form:
+        records = [
+            Record((*one.chain, *inner[1:]))
+            for one in records
+            for inner in each(one.node, form["inner"])
+        ]
+    for record in records:
+        if "nested" in form:  # objects on other objects
+            children = take(record.node, form["nested"]) or ()
+            records += [Record((*record.chain, child)) for child in enumerate(children)]
+    if "lacks" in form:
+        records = [one for one in records if spot(one.chain, form["lacks"]) is not None]
+    if "unique" in form:
+        records = [*{str(get(one.chain, form["unique"])): one for one in records}.values()]
+    scenes: dict[str, list[Record]] = {}
+    for name, record in zip(_scene_names(form, records), records, strict=True):
+        scenes.setdefault(name, []).append(record)
+    return scenes
+
+
+def _scene_names(form: Form, records: list[Record]) -> list[str]:
+    """Return the name of the scene of each record: its image, its frame, its room or its time."""
+    if "scene" in form:
+        found = [spot(one.chain, form["scene"]) for one in records]
+        if str(form["scene"]).endswith("@"):
+            return [str(key + 1 if isinstance(key, int) else key) for key in found]
+        return ["" if name is None else str(name) for name in found]
+    columns: list[list[str]] = []
+    for name in () if _is_named(form) else FIELDS["scene"]:
+        column = [str(value) if _is_plain(value := one.take(name)) else "" for one in records]
+        is_text = name == "frameid" and not all(map(_NUMBER.fullmatch, filter(None, column)))
+        if len({*column}) > 1 and not is_text and (name not in FIELDS["time"] or not columns):
+            columns.append(column)
+    return [", ".join(names) for names in zip(*columns, strict=True)] or [""] * len(records)
+
+
+def _is_named(form: Form) -> bool:
+    """Return whether a format names the fields of its boxes."""
+    return any(name in form for name in (*_IMAGE, *_SOLID))
+
+
+def _is_plain(value: Any) -> bool:
+    return isinstance(value, str | int | float) and value != ""
+
+
+def read(form: Form, records: list[Record], data: Any) -> Seen:
+    """Return what the records of one scene show. ``data`` is the whole data.
+
+    Raises:
+        MessageError: a value is text instead of a number.
+    """
+    return _Reader(form, data).seen(records)
+
+
+class _Reader:
+    def __init__(self, form: Form, data: Any) -> None:
+        self.form, self.data, self.root = form, data, ((None, data),)
+        self.notes: list[Note] = []
+        names = get(self.root, form["names"]) if "names" in form else None
+        if isinstance(names, list):
+            names = {take(one, "id"): take(one, "name") for one in names}
+        self.names = {str(key): name for key, name in (names or {}).items()}
+
+    def note(self, reason: Reason, detail: str) -> None:
+        self.notes.append(Note(None, reason, detail))
+
+    def seen(self, records: list[Record]) -> Seen:
+        form, chosen = self.form, self._chosen(records)
+        if "group" in form:
+            chosen = _merged(chosen, form["group"])
+        scores, sightings = self.scores(chosen), []
+        for n, record in enumerate(chosen):
+            what = f"object {n + 1}"
+            if isinstance(self.data, Rows):
+                what = f"line {record.chain[-1][0] + self.data.first}"
+            box, flat = self.boxes(record, what)
+            name, is_numbered = self.name(record)
+            is_unset = "zero" in form and take(record.node, "bbox") is not None
+            sightings.append(
+                Sighting(
+                    self.label(record), scores[n], name, self.frame(record), box, flat,
+                    is_unset=is_unset, is_numbered=is_numbered,
+                )
+            )  # fmt: skip
+        self.to_radians(sightings)
+        own = next((one.frame for one in sightings if one.frame), "")
+        whole = frame_of(take(self.data, "header")) or frame_of(self.data)
+        first, second = (own, whole) if "frame" in form else (whole, own)
+        frame = first or second or ("map" if "map" in form else "")
+        stamp = as_stamp(get(self.root, "header.stamp|stamp|timestamp"))
+        stamp = next(filter(None, (self.stamp(one) for one in chosen[:1])), stamp)
+        self.note_unread(chosen)
+        is_list = form["name"] == RECORDS["name"] and not isinstance(self.data, Rows)
+        if is_list and not any(one.solid or one.image for one in sightings):
+            self.note("no-box", "there are no boxes: the results of a classifier are no objects")
+        is_solid = form.get("is_solid")
+        return Seen(sightings, frame, stamp, self.viewer(), is_solid, self.notes)
+
+    def _chosen(self, records: list[Record]) -> list[Record]:
+        """Return the records without those that the format marks as no objects."""
+        skip = dict(self.form.get("skip", {}))
+        what = skip.pop("what", "")
+        chosen = [
+            one for one in records
+            if not any(get(one.chain, path) in values for path, values in skip.items())
+        ]  # fmt: skip
+        bare = self.form.get("bare", {"items": []})
+        found = (one for path in bare["items"] for one in each(self.data, path))
+        others = sum(get(one, bare.get("lacks", "-")) is None for one in found)
+        for count, name in ((len(records) - len(chosen), what), (others, bare.get("what"))):
+            if count:
+                self.note("excluded", f"the scene leaves out {count} {name}")
+        return chosen
+
+    def label(self, record: Record) -> Any:
+        if "label" in self.form:
+            label = spot(record.chain, self.form["label"])
+        else:
+            found = [v for n in FIELDS["label"] if _is_plain(v := record.take(n))]
+            words = (one for one in found if isinstance(one, str) and not _NUMBER.fullmatch(one))
+            label = next(words, found[0] if found else None)
+        return self.names.get(str(label), label)
+
+    def scores(self, records: list[Record]) -> list[Any]:
+        """Return the scores from 0 to 1; 1 for a record without the field of a score."""
+        spec, scores, is_percent = self.form.get("score"), [], self.form.get("percent", False)
+        for n, one in enumerate(records, 1):
+            score = one.first("score") if spec is None else spot(one.chain, spec)
+            if isinstance(score, str):
+                is_percent |= score.strip().endswith("%")
+                score = numeric(score.strip(" %"), f"object {n}, the score")
+            scores.append(1.0 if score is None and "is_solid" not in self.form else score)
+        finite = [value for one in scores if (value := number(one)) is not None]
+        has_parts = any(0 < score <= 1 for score in finite)
+        if not (is_percent or has_parts) and 1 < max(finite, default=0) <= 100:
+            is_percent = True
+            self.note("percent", "the scores count as percent")
+        if is_percent:
+            scores = [one if number(one) is None else one / 100 for one in scores]
+        return scores
+
+    def boxes(self, record: Record, what: str) -> tuple[Solid | None, Box | None]:
+        """Return the box with a position, or else the box in the image."""
+        form, chain = self.form, record.chain
+        if not _is_named(form):
+            return self.found(record, what)
+        values: dict[str, Any] = {
+            n: v for n in _SOLID if n in form and (v := spot(chain, form[n])) is not None
+        }
+        if form.get("is_aligned") and "size" in values:
+            values.pop("degrees", None)
+        box = self.set_box(values, what)
+        if box is None and "else" in form:
+            others = {n: v for n, s in form["else"].items() if (v := spot(chain, s)) is not None}
+            box = self.set_box(others, what)
+        if box is not None:
+            return box, None
+        kinds = ((kind, spot(chain, form[kind])) for kind in _IMAGE if kind in form)
+        kind, value = next(((kind, v) for kind, v in kinds if v is not None), ("", None))
+        if kind and "scale" in form and kind != "spans":
+            scale = numerics(spot(chain, form["scale"]) or [1.0, 1.0], what)
+            value = [part * scale[n % 2] for n, part in enumerate(numerics(value, what))]
+        tilt = math.radians(number(spot(chain, form.get("tilt", ""))) or 0.0)
+        theta = number(spot(chain, form.get("theta", ""))) or tilt
+        return None, image(kind, value, what, theta) if kind else None
+
+    def set_box(self, values: Mapping[str, Any], what: str) -> Solid | None:
+        """Return a box with a position. In messages, a box of zeros is unset."""
+        box = solid(self.form, values, what) if values else None
+        return None if box and self.form.get("zero") == "unset" and box.is_unset else box
+
+    def found(self, record: Record, what: str) -> tuple[Solid | None, Box | None]:
+        """Return the box of a record whose fields have usual names."""
+        for names in FIELDS["position"]:
+            if (value := record.take(names)) is not None:
+                if len(numerics(value, f"{what}, {names}")) == 3:
+                    values = {"position": value}
+                    for kind in ("size", "turn", "yaw", "degrees"):
+                        values[kind] = record.first(kind)
+                    values = {kind: value for kind, value in values.items() if value is not None}
+                    return solid(self.form, values, what), None
+                record.forget(names)
+        for kind, names in FIELDS["image"]:
+            if (value := record.take(names)) is not None:
+                if kind == "corners":  # further columns have the size of the image
+                    record.used |= {"width", "height"}
+                return None, image(kind, value, f"{what}, {names}")
+        return None, None
+
+    def to_radians(self, sightings: list[Sighting]) -> None:
+        """Convert yaws in degrees, which are larger than those in radians."""
+        yaws = [one.solid.yaw for one in sightings if one.solid and one.solid.yaw is not None]
+        if any(abs(yaw) > _TURN for yaw in yaws) and "degrees" not in self.form:
+            self.note("degrees", "yaw counts in degrees")
+            for one in sightings:
+                if one.solid and one.solid.yaw is not None:
+                    one.solid = one.solid._replace(yaw=math.radians(one.solid.yaw))
+
+    def name(self, record: Record) -> tuple[str, bool]:
+        """Return the id of the detection, and whether it is a number that follows the label."""
+        if (spec := self.form.get("id")) is not None:
+            return text(spot(record.chain, spec)), isinstance(spec, dict)
+        found = ((n, v) for n in FIELDS["id"] if (v := record.take(n)) is not None)
+        name, value = next(found, ("", ""))
+        return text(value), name[:5] == "track" or not isinstance(value, str)
+
+    def frame(self, record: Record) -> str:
+        if "frame" in self.form:
+            return text(get(record.chain, self.form["frame"])).lstrip("/")
+        frame = frame_of(take(record.node, "header")) or frame_of(record.node)
+        return "" if _NUMBER.fullmatch(frame) else frame
+
+    def stamp(self, record: Record) -> Any:
+        if "stamp" in self.form or _is_named(self.form):
+            return as_stamp(spot(record.chain, self.form.get("stamp", "")))
+        for name in FIELDS["time"]:
+            if (stamp := time_of(as_stamp(record.take(name)))) is not None:
+                return stamp
+            record.forget(name)
+        return None
+
+    def viewer(self) -> dict[str, float] | None:
+        agent = get(self.root, self.form["viewer"]) if "viewer" in self.form else None
+        at, yaw = take(agent, "position"), number(take(agent, "rotation", "y"))
+        box = solid(self.form, {"position": at, "degrees": yaw}, "viewer") if agent else None
+        if box is None or box.yaw is None:
+            return None
+        return {"x": box.position[0], "y": box.position[1], "yaw": box.yaw}
+
+    def note_unread(self, records: list[Record]) -> None:
+        """Note the fields that carry a box, a score, a frame or a time, and are not read."""
+        if "is_solid" in self.form:  # the layout of a ROS message is known
+            return
+        known = {*re.findall(r"\w+", json.dumps(self.form))}
+        names = dict.fromkeys(name for one in records[:_LOOKED_AT] for name in one.unread())
+        if unread := [name for name in names if name not in known]:
+            more = ", …" if len(unread) > _MOST_NAMES else ""
+            named = ", ".join(unread[:_MOST_NAMES])[:200] + more
+            self.note("unread", f"these fields are not read: {named}")
+
+
+def _merged(records: list[Record], path: str) -> list[Record]:
+    """Join the points of records of one group, which are parts of one object."""
+    groups: dict[Any, dict[str, Any]] = {}
+    for record in records:
+        group = get(record.chain, path)
+        key = (str(record.node["label"]), id(record) if group is None else str(group))
+        points = groups.get(key, {"points": []})["points"]
+        groups[key] = {**record.node, "points": [*points, *record.node["points"]]}
+    return [Record(((None, None), (n, thing))) for n, thing in enumerate(groups.values())]
+
+
+def as_stamp(value: Any) -> Any:
+    """Convert seconds, ms, µs or ns since 1970 to a time of ROS; return other values unchanged."""
+    if isinstance(value, str) and _NUMBER.fullmatch(value):
+        value = float(value)
+    if (seconds := number(value)) is None:
+        return None if isinstance(value, str) else value
+    while abs(seconds) > 1e11:
+        seconds /= 1000
+    whole, part = divmod(round(seconds * 1e6), 1_000_000)  # a float of today has no nanoseconds
+    return {"sec": whole, "nanosec": 1000 * part}
