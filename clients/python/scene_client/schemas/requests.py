@@ -114,13 +114,22 @@ class OrArray:
     def __get_pydantic_json_schema__(
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> JsonSchemaValue:
-        """Return a JSON schema with both forms."""
+        """Return a JSON schema with both forms.
+
+        Each value of the array fits one of the members, because generators of clients and function
+        calling do not read `prefixItems`, which would state the order.
+        """
         spelt_out = handler(schema)
         members = handler.resolve_ref_schema(spelt_out)["properties"]
+        kinds: list[JsonSchemaValue] = []
+        for member in members.values():
+            kind = {key: value for key, value in member.items() if key != "title"}
+            if kind not in kinds:
+                kinds.append(kind)
         array = {
             "type": "array",
             "description": ", ".join(members),
-            "prefixItems": list(members.values()),
+            "items": kinds[0] if len(kinds) == 1 else {"anyOf": kinds},
             "minItems": len(members),
             "maxItems": len(members),
         }
@@ -246,6 +255,12 @@ def _kind_of_object(value: object) -> str | None:
 # `validation.pointer` can distinguish tags from field names.
 OBJECT_TAGS = ("a label", "a detection")
 
+
+def _state_any_of(schema: dict[str, Any]) -> None:
+    """Convert `oneOf` of a schema to `anyOf`, because function calling does not support `oneOf`."""
+    schema["anyOf"] = schema.pop("oneOf")
+
+
 SceneObject = Annotated[
     Annotated[Label, Tag("a label")] | Annotated[Detection, Tag("a detection")],
     Discriminator(
@@ -253,6 +268,7 @@ SceneObject = Annotated[
         custom_error_type="object_kind",
         custom_error_message="must be a label or a JSON object with the field `label`",
     ),
+    Field(json_schema_extra=_state_any_of),
 ]
 
 
