@@ -5,11 +5,12 @@ example requests unchanged. Figures in the example answers are only illustrative
 question in `app.questions` contains the examples of this question.
 """
 
+from collections.abc import Mapping
 from typing import Any, Final
 
 from app.errors import UnknownLabelsError
 from app.questions import QUESTIONS
-from app.questions.question import BATCH, Example
+from app.questions.question import Example
 
 REQUEST_ID: Final = "0b0f5b1e-6b1f-4a52-9d5c-3f7a2f1f6c11"
 _MODEL: Final = {
@@ -45,9 +46,27 @@ def _batch(result: dict[str, Any]) -> dict[str, Any]:
     return {"request_id": REQUEST_ID, "results": [{"status": 200, "result": result}, failed]}
 
 
+def _batches(cases: Mapping[str, Example]) -> dict[str, Example]:
+    """Return example batches from the example requests of a question."""
+    valid = [case.value for case in cases.values() if case.problem is None]
+    unknown = next(case.value for case in cases.values() if case.problem == "unknown-labels")
+    return {
+        "scenes": Example("two scenes", {"scenes": valid[:2]}),
+        "bad-entry": Example(
+            "an invalid scene, which does not affect the other scenes",
+            {"scenes": [valid[0], unknown]},
+        ),
+        "empty": Example("an empty list of scenes", {"scenes": []}, "invalid-request"),
+    }
+
+
 REQUESTS: Final[dict[str, dict[str, Example]]] = {
     **{question.name: dict(question.examples) for question in QUESTIONS},
-    **{f"{question.name}_batch": BATCH for question in QUESTIONS if not question.samples},
+    **{
+        f"{question.name}_batch": _batches(question.examples)
+        for question in QUESTIONS
+        if not question.samples
+    },
     "confirm": {
         "bedroom": Example(
             "a bedroom in which everything is right",

@@ -171,13 +171,3 @@ REFUSED: Final[dict[str, Example]] = {
     ),
 }
 """Invalid example requests for every question."""
-
-BATCH: Final[dict[str, Example]] = {
-    "scenes": Example("two scenes", {"scenes": [LABELS, BEDROOM]}),
-    "bad-entry": Example(
-        "an invalid scene, which does not affect the other scenes",
-        {"scenes": [LABELS | {"room_type": "bedroom"}, {"objects": ["desk", "nigthstand"]}]},
-    ),
-    "empty": Example("an empty list of scenes", {"scenes": []}, "invalid-request"),
-}
-"""Example requests for every batch route."""
