@@ -1,5 +1,7 @@
 """The OpenAPI document: stable operation ids, and all problems of each route."""
 
+import json
+from collections.abc import Iterable
 from typing import Any, Final
 
 from fastapi import FastAPI
@@ -19,6 +21,8 @@ from scene_client.schemas import MAX_SEED, Problem
 Responses = dict[int | str, dict[str, Any]]
 
 _REFERENCE: Final = "#/components/schemas/{model}"
+_LONG: Final = 130
+"""Minimum length of a shared part of the document in characters of JSON."""
 
 _KEY_SCHEMES: Final = {
     "api-key": {"type": "apiKey", "in": "header", "name": API_KEY},
@@ -69,19 +73,21 @@ def operation_id(route: APIRoute) -> str:
     return route.name
 
 
-def _state_whole_numbers(node: Any) -> None:
-    """Convert the bounds of integers from float to int, because a float rounds large bounds."""
-    if isinstance(node, dict):
-        if node.get("type") == "integer":
+def _tidy(schema: Any) -> None:
+    """Remove titles, which repeat names. Convert bounds of integers from float to int."""
+    if isinstance(schema, dict):
+        if isinstance(schema.get("title"), str):
+            del schema["title"]
+        if schema.get("type") == "integer":
             for bound in ("minimum", "maximum"):
-                if bound in node:
+                if bound in schema:
                     # As a float, MAX_SEED is rounded up.
-                    node[bound] = min(int(node[bound]), MAX_SEED)
-        for value in node.values():
-            _state_whole_numbers(value)
-    elif isinstance(node, list):
-        for value in node:
-            _state_whole_numbers(value)
+                    schema[bound] = min(int(schema[bound]), MAX_SEED)
+        for value in schema.values():
+            _tidy(value)
+    elif isinstance(schema, list):
+        for value in schema:
+            _tidy(value)
 
 
 class DocumentedAPI(FastAPI):
@@ -107,7 +113,7 @@ async def show_document(http: Request) -> Response:
 
 
 def _complete(document: dict[str, Any], settings: Settings) -> None:
-    """Add the schema of problems, the examples, the API key and the problems of each operation."""
+    """Add problems, examples and the API key, and state each repeated part only once."""
     schemas = document["components"]["schemas"]
     problem = Problem.model_json_schema(mode="serialization", ref_template=_REFERENCE)
     schemas |= problem.pop("$defs") | {"Problem": problem}
@@ -118,7 +124,62 @@ def _complete(document: dict[str, Any], settings: Settings) -> None:
     schemas.pop("ValidationError", None)
     if settings.api_key is not None:
         document["components"].setdefault("securitySchemes", {}).update(_KEY_SCHEMES)
-    _state_whole_numbers(document)
+    _tidy(schemas)
+    _share_parts(document)
+
+
+def _share_parts(document: dict[str, Any]) -> None:
+    """Move repeated responses, parameters, examples and fields to the components."""
+    operations = [one for path in document["paths"].values() for one in path.values()]
+    errors = [
+        (".".join(response["content"][MEDIA_TYPE]["examples"]), operation["responses"], status)
+        for operation in operations
+        for status, response in operation["responses"].items()
+        if MEDIA_TYPE in response["content"]
+    ]
+    parameters = [
+        (parameter["name"], operation["parameters"], number)
+        for operation in operations
+        for number, parameter in enumerate(operation.get("parameters", ()))
+    ]
+    requests = [
+        (name, body["examples"], name)
+        for operation in operations
+        if "requestBody" in operation
+        for body in operation["requestBody"]["content"].values()
+        for name in body["examples"]
+    ]
+    fields = [
+        (f"{name.title().replace('_', '')}Field", schema["properties"], name)
+        for schema in document["components"]["schemas"].values()
+        for name in schema.get("properties", ())
+    ]
+    parts = {
+        "responses": errors, "parameters": parameters, "examples": requests, "schemas": fields,
+    }  # fmt: skip
+    for kind, places in parts.items():
+        _share(document["components"], kind, places)
+
+
+def _share(components: dict[str, Any], kind: str, places: Iterable[tuple[str, Any, Any]]) -> None:
+    """Replace long equal parts of the document by references to one component.
+
+    A place is the name of the component, the dictionary or list with the part, and its key. If
+    different parts have the same name, only the first of them becomes a component.
+    """
+    equal: dict[tuple[str, str], list[tuple[Any, Any]]] = {}
+    for name, parent, key in places:
+        equal.setdefault((name, json.dumps(parent[key])), []).append((parent, key))
+    shared = components.setdefault(kind, {})
+    for (name, text), parents in equal.items():
+        if len(parents) > 1 and len(text) > _LONG and name not in shared:
+            shared[name] = json.loads(text)
+            reference = {"$ref": f"#/components/{kind}/{name}"}
+            if "default" in shared[name]:
+                # Redoc shows only a default beside the reference.
+                reference["default"] = shared[name].pop("default")
+            for parent, key in parents:
+                parent[key] = reference
 
 
 def _complete_operation(operation: dict[str, Any], path: str, settings: Settings) -> None:

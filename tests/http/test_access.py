@@ -14,7 +14,7 @@ from httpx import ASGITransport, AsyncClient, Response
 
 from app.api.gateway import HEALTH
 from app.settings import Settings
-from tests.http.test_documentation import operations
+from tests.http.test_documentation import inlined, operations
 from tests.http.test_problems import problem
 from tests.services import (
     DEFECTIVE,
@@ -213,7 +213,7 @@ async def test_only_health_needs_no_key(guarded: AsyncClient, document: dict[str
         problem(response, 401, "unauthorized")
         assert response.headers["www-authenticate"] == "Bearer"
         assert named == schemes.keys(), path
-        (content,) = operation["responses"]["401"]["content"].values()
+        (content,) = inlined(operation["responses"]["401"], document)["content"].values()
         assert "unauthorized" in content["examples"]
 
 

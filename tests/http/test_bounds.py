@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from httpx import Client, ConnectError, Response
 
+from tests.http.test_documentation import inlined
 from tests.http.test_problems import problem
 from tests.services import Pause, launch, serve, wait_until
 
@@ -31,7 +32,7 @@ async def test_a_deadline_is_a_whole_number_within_the_limit(shared_store: Path)
             # Health checks ignore the header.
             assert (await client.get("/health/ready", headers=headers)).is_success
         document = (await client.get("/openapi.json", headers=headers)).json()
-    parameters = document["paths"]["/missing"]["post"]["parameters"]
+    parameters = inlined(document["paths"]["/missing"]["post"]["parameters"], document)
     assert [p["schema"]["maximum"] for p in parameters if "Timeout" in p["name"]] == [600_000]
 
 
