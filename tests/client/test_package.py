@@ -147,13 +147,13 @@ def test_python_310(source: Path, tmp_path: Path, live: LiveService) -> None:
 
 
 GENERATED = """
-import json, sys
+import importlib, json, pkgutil, sys
+import generated
 from generated import Client, models
 from generated.api import questions
-import generated.api.questions.generate, generated.api.questions.missing
-import generated.api.questions.outliers, generated.api.questions.relations
-import generated.api.questions.rooms
 
+for module in pkgutil.walk_packages(generated.__path__, "generated."):
+    importlib.import_module(module.name)
 client = Client(sys.argv[1])
 for name, fields in json.loads(sys.argv[2]).items():
     request = getattr(models, name.title() + "Request").from_dict(fields)
@@ -163,7 +163,7 @@ for name, fields in json.loads(sys.argv[2]).items():
 
 
 @pytest.mark.slow
-def test_a_generated_client_asks_all_five_questions(live: LiveService, tmp_path: Path) -> None:
+def test_a_generated_client_asks_each_question(live: LiveService, tmp_path: Path) -> None:
     pytest.importorskip("openapi_python_client")
     (tmp_path / "openapi.json").write_bytes(live.client.get("/openapi.json").content)
     # The generator formats its code with ruff.
@@ -174,17 +174,33 @@ def test_a_generated_client_asks_all_five_questions(live: LiveService, tmp_path:
         cwd=tmp_path,
         env=os.environ | {"PATH": path},
     )
-    run_program(sys.executable, "-m", "compileall", "-q", "generated", cwd=tmp_path)
     lamp = {"label": "lamp", "id": "l", "position": {"x": 1.0, "y": 0.0, "z": 0.5}}
     scene = {"objects": ["bed", lamp], "relations": [["l", "left", "bed"]], "seed": 7}
     requests = dict.fromkeys(("relations", "missing", "outliers", "rooms", "generate"), scene)
+    requests["where"] = {"label": "desk", "rooms": [{"id": "bedroom", "objects": ["bed", lamp]}]}
     command = (sys.executable, "-c", GENERATED, live.url, json.dumps(requests))
     done = run_program(*command, cwd=tmp_path)
     answers = dict(map(json.loads, done.stdout.splitlines()))
     assert answers.keys() == requests.keys()
     for question, answer in answers.items():
-        expected = live.client.post(f"/{question}", json=scene).json()
+        expected = live.client.post(f"/{question}", json=requests[question]).json()
         assert answer == expected | {"request_id": answer["request_id"]}
+
+
+@pytest.mark.slow
+@pytest.mark.system
+def test_generated_types_of_typescript_compile(
+    live: LiveService, tmp_path: Path, find_tool: FindTool
+) -> None:
+    folder = shutil.copytree(REPOSITORY / "tests/client/typescript", tmp_path / "typescript")
+    (folder / "openapi.json").write_bytes(live.client.get("/openapi.json").content)
+    find_tool("node")
+    run_program(find_tool("npm"), "ci", "--ignore-scripts", "--no-audit", "--no-fund", cwd=folder)
+    programs = folder / "node_modules/.bin"
+    types = ("openapi.json", "--output", "generated.ts", "--default-non-nullable=false")
+    run_program(programs / "openapi-typescript", *types, cwd=folder)
+    strict = ("--noEmit", "--strict", "--target", "es2022", "--module", "preserve")
+    run_program(programs / "tsc", *strict, "questions.ts", cwd=folder)
 
 
 GUIDE = (REPOSITORY / "docs" / "clients.md").read_text(encoding="utf-8")
