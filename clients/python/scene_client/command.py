@@ -7,21 +7,20 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any, Final, NoReturn, TypeVar, get_args
+from typing import Annotated, Any, Final, NoReturn, TypeVar
 
 import typer
 from pydantic import BaseModel
 from rich.console import Console, RenderableType
 from typer.core import TyperGroup
 
-from scene_client import __version__, tables
+from scene_client import __version__, phrases, tables
 from scene_client.errors import (
     ClientError,
     DeadlineError,
@@ -35,7 +34,7 @@ from scene_client.formats import from_data
 from scene_client.frames import CONVENTIONS, BoxOrigin, Extents, QuaternionOrder, Units, Up
 from scene_client.offline import OfflineClient
 from scene_client.ros_fields import MessageError
-from scene_client.schemas import Detail, RelationName, Sensitivity, UnknownLabels
+from scene_client.schemas import Detail, Sensitivity, UnknownLabels
 from scene_client.sync import Client
 
 REFUSED, MEANINGLESS, UNREACHABLE, LATE, BUSY, FAILED = range(1, 7)
@@ -45,7 +44,6 @@ _VALUED: Final = (
     *("--url", "--model", "--offline", "--timeout", "--record"),
     *(f"--{name.replace('_', '-')}" for name in CONVENTIONS),
 )
-_RELATIONS: Final = get_args(RelationName)
 _MAX_NOTES: Final = 10  # maximum number of printed notes on a file
 
 
@@ -95,18 +93,21 @@ class Options:
     record: Path | None
     conventions: dict[str, str]
 
-    def client(self) -> Client:
+    def client(self, api_key: str | None = None) -> Client:
         """Return the client that sends the question."""
         if self.store is not None:
             return OfflineClient(
                 self.store, timeout=self.timeout, model=self.model, record=self.record
             )
-        # An environment variable sets the API key, because other users of the machine can read the
-        # options of a process.
-        key = os.environ.get("SCENE_API_KEY") or None
         return Client(
-            self.url, timeout=self.timeout, model=self.model, api_key=key, record=self.record
+            self.url, timeout=self.timeout, model=self.model, api_key=api_key, record=self.record
         )
+
+
+def _api_key() -> str | None:
+    # An environment variable sets the API key, because other users of the machine can read the
+    # options of a process.
+    return os.environ.get("SCENE_API_KEY") or None
 
 
 def _show(
@@ -116,7 +117,7 @@ def _show(
 ) -> None:
     """Print the answer to a question as JSON or as a table. An error ends the program."""
     options: Options = context.obj
-    with _exit_on_error(), options.client() as client:
+    with _exit_on_error(), options.client(_api_key()) as client:
         answer = question(client)
     if options.as_json:
         print(answer.model_dump_json(exclude_unset=True))
@@ -155,7 +156,7 @@ def main(
     timeout: Annotated[
         float, typer.Option(help="Maximum time of the whole call in seconds.")
     ] = 10.0,
-    json: Annotated[bool, typer.Option("--json", help="Print the answer as JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the answer as JSON.")] = False,
     record: Annotated[
         Path | None,
         typer.Option(
@@ -187,7 +188,7 @@ def main(
         up=up, units=units, extents=extents, box_origin=box_origin,
         quaternion_order=quaternion_order,
     )  # fmt: skip
-    context.obj = Options(url, model, offline, timeout, json, record, conventions)
+    context.obj = Options(url, model, offline, timeout, as_json, record, conventions)
 
 
 # ---------------------------------------------------------------------------------- questions
@@ -285,7 +286,7 @@ def missing(
     scene = _scene(
         context, things, label_map, relations, room_type=room_type, unknown_labels=unknown_labels
     )
-    place = None if at is None else _anchor(at)
+    place = None if at is None else _read("--at", at, phrases.place)
     request = scene | _named(
         top_k=top_k, coverage=coverage, at=place, candidates=candidates or None, detail=detail
     )
@@ -394,7 +395,7 @@ def where(
     except (MessageError, HomeFileError) as error:
         _fail(str(error))
     general: Options = context.obj
-    places = [_search(text) for text in searched or ()]
+    places = [_read("--searched", text, phrases.search) for text in searched or ()]
     fields |= general.conventions | _named(top_k=top_k, unknown_labels=unknown_labels)
     if places:
         fields["searched"] = [*fields.get("searched", ()), *places]
@@ -420,7 +421,7 @@ def vocabulary(context: typer.Context) -> None:
 def ready(context: typer.Context) -> None:
     """Check that the service is ready. The only output is the exit status."""
     options: Options = context.obj
-    with _exit_on_error(), options.client() as client:
+    with _exit_on_error(), options.client(_api_key()) as client:
         client.check_ready()
 
 
@@ -453,7 +454,8 @@ def _scene(
         print(f"{files[0]}: {which}{note.detail}", file=sys.stderr)
     if (more := len(scene.notes) - _MAX_NOTES) > 0:
         print(f"{files[0]}: {more} more notes of this kind", file=sys.stderr)
-    relations = [_relation(text) for text in stated] if stated else None
+    read = partial(_read, "--relations", read=phrases.relation)
+    relations = [read(text) for text in stated] if stated else None
     general: Options = context.obj
     return scene | general.conventions | _named(relations=relations, **options)
 
@@ -469,39 +471,12 @@ def _labels(thing: str) -> list[str]:
     return [label.strip() for label in thing.split(",") if label.strip()]
 
 
-def _anchor(text: str) -> dict[str, str]:
-    relation, _, object = text.strip().partition(" ")
-    if relation not in _RELATIONS or not object:
-        rule = '--at must be a relation and an object, such as "on-top desk"'
-        _fail(f"{rule}; {_relations_for([relation])}")
-    return {"relation": relation, "object": object.strip()}
-
-
-def _search(text: str) -> dict[str, Any]:
-    room, _, place = text.partition(":")
-    name, _, share = place.partition(":")
+def _read(option: str, text: str, read: Callable[[str], dict[str, Any]]) -> dict[str, Any]:
+    """Return the parts of the text of an option; see `phrases`."""
     try:
-        return {"room": room} | _named(object=name or None, seen_share=float(share or 1))
-    except ValueError:
-        _fail(f"--searched must be ROOM, ROOM:OBJECT or ROOM:OBJECT:SHARE, and not {text}")
-
-
-def _relation(text: str) -> dict[str, str]:
-    # Labels may contain spaces. The first name of a relation separates the two labels.
-    words = text.split()
-    middle = next((n for n, word in enumerate(words[1:-1], 1) if word in _RELATIONS), None)
-    if middle is None:
-        rule = '--relations must be a subject, a relation and an object, as in "lamp on-top desk"'
-        _fail(f"{rule}; {_relations_for(words[1:-1])}")
-    subject, object = " ".join(words[:middle]), " ".join(words[middle + 1 :])
-    return {"subject": subject, "relation": words[middle], "object": object}
-
-
-def _relations_for(words: Iterable[str]) -> str:
-    """Return the names of the relations, and names that are similar to one of the words."""
-    similar = [name for word in words for name in get_close_matches(word, _RELATIONS, 1)]
-    hint = f" (did you mean {similar[0]}?)" if similar else ""
-    return f"relations: {', '.join(_RELATIONS)}{hint}"
+        return read(text)
+    except ValueError as error:
+        _fail(f"{option} {error}")
 
 
 # ------------------------------------------------------------------------------------- errors

@@ -11,6 +11,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 
 from scene_client import schemas
+from scene_client.phrases import PREPOSITIONS
 
 MOST_MISPLACED: Final = 10
 """Maximum number of table rows with probably false relations.
@@ -29,12 +30,6 @@ A table of answers about one place contains all places.
 
 POSSIBLE_PLACE: Final = 0.01
 """Minimum probability of a place in a table of the places of one thing."""
-
-_PREPOSITIONS: Final[dict[schemas.RelationName, str]] = {
-    "left": "left of", "right": "right of", "front": "in front of", "on-top": "on top of",
-    "contains": "around",
-}  # fmt: skip
-"""Words for the relations that are no prepositions."""
 
 
 def relations(answer: schemas.RelationsAnswer) -> RenderableType:
@@ -265,7 +260,7 @@ def _place(spot: schemas.Spot) -> str:
         return f"{spot.room}: seen there ({spot.object})"
     if spot.relation is None:
         return f"{spot.room}: elsewhere"
-    return f"{spot.room}: {_PREPOSITIONS.get(spot.relation, spot.relation)} {spot.object}"
+    return f"{spot.room}: {PREPOSITIONS[spot.relation]} {spot.object}"
 
 
 def _placement(placement: schemas.Placement) -> str:
