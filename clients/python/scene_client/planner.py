@@ -1,0 +1,291 @@
+"""Tools for planners with a language model. Each tool asks one question and answers in sentences.
+
+`schemas` describes the tools to a language model, and `call` runs a tool that the model has called.
+The MCP server (`mcp_server`) lists the same tools. docs/planners.md describes them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, ClassVar, Final, Literal
+
+from pydantic import BeforeValidator, Field, WithJsonSchema
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+from pydantic_core import core_schema
+
+from scene_client import phrases, sentences
+from scene_client.calls import validated
+from scene_client.errors import ClientError, InvalidRequestError
+from scene_client.schemas import Relation, Request
+from scene_client.schemas.missing import Anchor
+from scene_client.schemas.requests import Label, SceneObject, SomeObjects
+from scene_client.schemas.where import Searched
+from scene_client.sync import Client
+
+Vendor = Literal["openai", "anthropic", "langchain"]
+
+_SAMPLES: Final = 20  # rooms from which `imagine_room` counts
+
+
+class ToolError(ClientError):
+    """A tool has no answer. The text is one sentence for the language model, with the remedy."""
+
+
+# ---------------------------------------------------------------------------------- arguments
+
+_TEXTS: Final = {"type": "array", "items": {"type": "string"}}
+_TRIPLE: Final = {"type": "array", "items": {"type": "number"}}
+# The schema is smaller than that of a detection, so a language model fills it in correctly.
+_OBJECTS: Final = {
+    "type": "array",
+    "items": {
+        "anyOf": [
+            {"type": "string"},
+            {
+                "type": "object",
+                "properties": {
+                    "label": {"type": "string"},
+                    "position": {
+                        **_TRIPLE,
+                        "description": "centre in metres: [ahead, left, up] of the robot",
+                    },
+                    "size": {**_TRIPLE, "description": "extents in metres, along the same axes"},
+                },
+                "required": ["label"],
+            },
+        ]
+    },
+}
+_HOME: Final = {"type": "object", "additionalProperties": _TEXTS}
+
+
+def _spoken(read: Callable[[str], dict[str, Any]]) -> BeforeValidator:
+    return BeforeValidator(lambda value: read(value) if isinstance(value, str) else value)
+
+
+Objects = Annotated[SomeObjects, WithJsonSchema(_OBJECTS)]
+Labels = Annotated[list[Label], WithJsonSchema(_TEXTS)]
+Relations = Annotated[list[Annotated[Relation, _spoken(phrases.relation)]], WithJsonSchema(_TEXTS)]
+Place = Annotated[Anchor, _spoken(phrases.place), WithJsonSchema({"type": "string"})]
+Home = Annotated[
+    dict[str, list[SceneObject]], Field(min_length=1, max_length=32), WithJsonSchema(_HOME)
+]
+Places = Annotated[list[Annotated[Searched, _spoken(phrases.search)]], WithJsonSchema(_TEXTS)]
+
+
+class _Schema(GenerateJsonSchema):
+    """Schemas without titles and defaults. An optional argument has the schema of its value."""
+
+    def field_title_should_be_set(self, schema: Any) -> bool:
+        return False
+
+    def default_schema(self, schema: core_schema.WithDefaultSchema) -> JsonSchemaValue:
+        return self.generate_inner(schema["schema"])
+
+    def nullable_schema(self, schema: core_schema.NullableSchema) -> JsonSchemaValue:
+        return self.generate_inner(schema["schema"])
+
+    def str_schema(self, schema: core_schema.StringSchema) -> JsonSchemaValue:
+        return {"type": "string"}
+
+
+class Tool(Request):
+    """Base class of the tools. The fields are the arguments, the docstring is the description."""
+
+    name: ClassVar[str]
+
+    @classmethod
+    def description(cls) -> str:
+        """Return what the tool does, for the language model."""
+        return " ".join((cls.__doc__ or "").split())
+
+    @classmethod
+    def parameters(cls) -> dict[str, Any]:
+        """Return the JSON schema of the arguments."""
+        schema = cls.model_json_schema(schema_generator=_Schema)
+        return {name: schema[name] for name in ("type", "properties", "required") if name in schema}
+
+    def answer(self, client: Client) -> str:
+        """Ask the client, and return the answer in sentences."""
+        raise NotImplementedError
+
+    def fields(self) -> dict[str, Any]:
+        """Return the arguments as fields of a request. Unknown words are read by their meaning."""
+        return self.model_dump(exclude_none=True) | {"unknown_labels": "by-meaning"}
+
+
+class _SceneTool(Tool):
+    objects: Objects
+    """the objects of one room, in plain words; with positions only if they are measured"""
+    relations: Relations | None = None
+    """known relations, such as "lamp on-top desk": left, right, front, behind, on-top, under,
+    above, below, inside, contains"""
+    room_type: Label | None = None
+    """kind of the room, only if it is certain"""
+
+
+class FindOutOfPlace(_SceneTool):
+    """Find the objects of a room that do not belong there, or that are in a wrong place. Use it
+    for "is anything odd here?", and before tidying up."""
+
+    name: ClassVar = "find_out_of_place"
+
+    def answer(self, client: Client) -> str:
+        """Return the objects that do not belong, and those in wrong places."""
+        found = client.outliers(**self.fields())
+        return sentences.text(found, sentences.out_of_place(found))
+
+
+class SuggestMissing(_SceneTool):
+    """Suggest the objects that a room probably has or lacks beside the listed ones, and where each
+    would be. Use it for "what is missing?", "what else is there?" and "what belongs on a desk?"."""
+
+    name: ClassVar = "suggest_missing"
+
+    at: Place | None = None
+    """ask only about this place, such as "on-top desk"; the object must be in `objects`"""
+    only: Labels | None = None
+    """ask only about these things, for example ["kettle"] for "is there a kettle?\""""
+
+    def answer(self, client: Client) -> str:
+        """Return the likely missing objects with their places."""
+        fields = self.fields()
+        if "only" in fields:
+            fields["candidates"] = fields.pop("only")
+        found = client.missing(**fields, top_k=8)
+        return sentences.text(found, sentences.missing(found))
+
+
+class LocateObject(Tool):
+    """Find where a thing is, or where it belongs, in a home whose rooms are known. Use it for
+    "where are my keys?", to search for a thing, and to put a thing away."""
+
+    name: ClassVar = "locate_object"
+
+    thing: Label
+    """the wanted thing, as one common word such as "mug\""""
+    rooms: Home
+    """the rooms of the home with their objects, such as {"kitchen": ["fridge", "counter"]}"""
+    searched: Places | None = None
+    """places already searched in vain: "bathroom", or "kitchen: counter" for one object"""
+
+    def answer(self, client: Client) -> str:
+        """Return the likely rooms and places of the thing."""
+        fields = self.fields() | {"label": self.thing}
+        del fields["thing"]
+        # A stated room type that is unknown is listed in the answer; a mere id is not.
+        fields["rooms"] = [
+            {"id": name, "room_type": name, "objects": objects}
+            for name, objects in fields["rooms"].items()
+        ]
+        found = client.where(**fields)
+        return sentences.text(found, sentences.where(found), rooms=self.rooms)
+
+
+class IdentifyRoom(Tool):
+    """Tell which kind of room has these objects. For a single object, tell in which kinds of rooms
+    it usually is. Use it for "which room is this?" and "in which room do people keep scissors?"."""
+
+    name: ClassVar = "identify_room"
+
+    objects: Labels
+    """the objects of one room in plain words, or one object"""
+    candidates: Labels | None = None
+    """the possible rooms, such as ["kitchen", "bathroom"]; default: all kinds of rooms"""
+
+    def answer(self, client: Client) -> str:
+        """Return the likely room types."""
+        found = client.rooms(**self.fields())
+        return sentences.text(found, sentences.rooms(found, self.objects))
+
+
+class RelateObjects(_SceneTool):
+    """Tell how the objects of a room probably stand to each other: what is on, in, under or beside
+    what. Use it for "where in the room is the book?" and to check relations."""
+
+    name: ClassVar = "relate_objects"
+
+    def answer(self, client: Client) -> str:
+        """Return the likely relations, and those that are unusual."""
+        found = client.relations(**self.fields(), top_k=256, min_probability=sentences.MENTIONED)
+        return sentences.text(found, sentences.relations(found))
+
+
+class ImagineRoom(Tool):
+    """Imagine a typical room of a kind: which objects it has, and where they stand. Use it for
+    "what does a dentist's room look like?"."""
+
+    name: ClassVar = "imagine_room"
+
+    room_type: Label | None = None
+    """kind of the room, such as "kitchen" or "dental office\""""
+    objects: Labels | None = None
+    """objects that the room must have"""
+
+    def answer(self, client: Client) -> str:
+        """Return the commonest objects and relations of sampled rooms."""
+        if self.room_type is None and not self.objects:
+            raise InvalidRequestError.about("give `room_type`, `objects` or both")
+        # The same arguments give the same answer, so a planner can rely on it.
+        fields = {"objects": [], **self.fields()}
+        found = client.generate(**fields, count=_SAMPLES, seed=0)
+        return sentences.text(found, sentences.imagined(found))
+
+
+TOOLS: Final[dict[str, type[Tool]]] = {
+    tool.name: tool
+    for tool in (
+        FindOutOfPlace, SuggestMissing, LocateObject, IdentifyRoom, RelateObjects, ImagineRoom
+    )
+}  # fmt: skip
+
+
+def schemas(vendor: Vendor) -> list[dict[str, Any]]:
+    """Return the tools in the form of a vendor.
+
+    Args:
+        vendor: `openai` for tools of chat completions, `anthropic` for tools of the Messages API,
+            `langchain` for JSON schemas with title and description, as `bind_tools` takes them.
+    """
+    forms: dict[Vendor, Callable[[type[Tool]], dict[str, Any]]] = {
+        "openai": lambda tool: {
+            "type": "function",
+            "function": {
+                "name": tool.name,
+                "description": tool.description(),
+                "parameters": tool.parameters(),
+                # Strict functions would require all arguments.
+                "strict": False,
+            },
+        },
+        "anthropic": lambda tool: {
+            "name": tool.name,
+            "description": tool.description(),
+            "input_schema": tool.parameters(),
+        },
+        "langchain": lambda tool: {
+            "title": tool.name,
+            "description": tool.description(),
+            **tool.parameters(),
+        },
+    }
+    return [forms[vendor](tool) for tool in TOOLS.values()]
+
+
+def call(client: Client, name: str, arguments: Mapping[str, Any]) -> str:
+    """Run a tool that a language model has called, and return the answer in sentences.
+
+    Args:
+        client: the client that asks the service, also an `OfflineClient`.
+        name: name of the tool.
+        arguments: arguments of the tool, as the schema describes them.
+
+    Raises:
+        ToolError: the tool has no answer. The text is for the language model.
+    """
+    try:
+        if name not in TOOLS:
+            raise InvalidRequestError.about(f"no tool {name}; the tools are {', '.join(TOOLS)}")
+        return validated(TOOLS[name], dict(arguments)).answer(client)
+    except ClientError as error:
+        raise ToolError(sentences.failure(error)) from error

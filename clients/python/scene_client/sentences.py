@@ -1,0 +1,258 @@
+"""Answers and errors as sentences for a language model, with the numbers that they rest on."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator
+from typing import Final, TypeAlias
+
+from scene_client.errors import (
+    ClientError,
+    DeadlineError,
+    InvalidRequestError,
+    ProblemError,
+    UnreachableError,
+)
+from scene_client.phrases import PREPOSITIONS
+from scene_client.schemas import (
+    Answer,
+    GenerateAnswer,
+    MissingAnswer,
+    OutliersAnswer,
+    RelationsAnswer,
+    RoomsAnswer,
+    ScoredRelation,
+    WhereAnswer,
+)
+from scene_client.schemas.missing import MissingObject
+from scene_client.schemas.outliers import MisplacedRelation
+from scene_client.schemas.where import Spot
+
+LIKELY: Final = 0.5
+"""Minimum probability of a fact. An answer lists the others as possible."""
+MENTIONED: Final = 0.05
+"""Minimum probability of a possible room or relation."""
+MOST: Final = 12
+"""Maximum number of entries of a list."""
+_DOUBTFUL: Final = 0.2  # minimum probability of an object to name it without an alarm
+_LIKELY_PLACE: Final = 0.25  # minimum probability of the place of a missing object
+_MOST_SPOTS: Final = 4  # maximum number of places in a room
+_LEAST_SPOT: Final = 0.01
+
+Fact: TypeAlias = tuple[str, float, str]
+"""A name, its probability and a further note, which may be empty."""
+
+
+def text(answer: Answer, sentences: Iterable[str], rooms: Collection[str] = ()) -> str:
+    """Return an answer as text: first the omitted and guessed words, then the warnings.
+
+    Args:
+        answer: the answer.
+        sentences: sentences about the answer.
+        rooms: names of rooms in the request, whose objects count if the name is unknown.
+    """
+    return " ".join([*_words(answer, rooms), *_warnings(answer), *sentences])
+
+
+def _words(answer: Answer, rooms: Collection[str]) -> Iterator[str]:
+    hint = "a commoner word may help"
+    if ignored := [f'"{name}"' for name in answer.ignored if name not in rooms]:
+        pronoun = "it" if len(ignored) == 1 else "them"
+        yield f"I do not know {', '.join(ignored)} and left {pronoun} out ({hint})."
+    if unknown := [f'"{name}"' for name in answer.ignored if name in rooms]:
+        yield f"I do not know the kind of room {', '.join(unknown)}, and go by the objects there."
+    for entry in answer.mapped:
+        if entry.rule in ("spelling", "head"):
+            yield f'I read "{entry.label}" as {entry.class_} (a guess).'
+        elif entry.rule == "meaning":
+            guess = f"near {entry.class_} (a guess; {hint})"
+            yield f'I know "{entry.label}" only by its meaning, {guess}.'
+
+
+def _warnings(answer: Answer) -> Iterator[str]:
+    for warning in answer.warnings:
+        if warning.rooms:
+            parts = "; ".join(f"{one.room_type}: {', '.join(one.objects)}" for one in warning.rooms)
+            yield f"These are probably objects of several rooms ({parts}): ask about each room."
+        else:
+            lead = "Not judged" if warning.code == "not-judged" else "Note"
+            yield f"{': '.join(filter(None, (lead, ', '.join(warning.objects), warning.message)))}."
+
+
+def out_of_place(answer: OutliersAnswer) -> Iterator[str]:
+    """Say which objects do not belong, which are in wrong places, and which are not judged."""
+    guessed = {entry.label for entry in answer.mapped if entry.rule == "meaning"}
+    warned = {name for one in answer.warnings if one.code == "not-judged" for name in one.objects}
+    groups: dict[str, list[Fact]] = {name: [] for name in ("odd", "unreal", "doubtful", "fitting")}
+    unknown = []
+    for one in answer.outliers:
+        if one.log_odds is None or guessed & {one.label, one.listed_as}:
+            unknown.append(one.object)
+        elif one.is_outlier:
+            usual = f"usually with {', '.join(one.usually_with)}" if one.usually_with else ""
+            groups["odd"].append((one.object, one.probability, usual))
+        elif one.reason == "misdetection":
+            groups["unreal"].append((one.object, 1 - (one.real or 0), ""))
+        elif one.object not in warned:
+            group = "doubtful" if one.probability >= _DOUBTFUL else "fitting"
+            groups[group].append((one.object, one.probability, ""))
+    moved = [(_wrong(one), one.probability, "") for one in answer.misplaced if one.is_misplaced]
+    yield from _facts("Out of place", groups["odd"])
+    yield from _facts("In a wrong place", moved)
+    yield from _facts("Probably wrong detections", groups["unreal"])
+    yield from _facts("Perhaps out of place, but no alarm", groups["doubtful"])
+    if unknown:
+        yield f"Not judged, as it may be anywhere or I know it too little: {', '.join(unknown)}."
+    if fitting := groups["fitting"]:
+        is_all = len(fitting) == len(answer.outliers) and not moved
+        most = max(0.01, *(probability for _, probability, _ in fitting))
+        yield f"{'All objects fit' if is_all else 'All else fits'} (each at most {most:.2f})."
+
+
+def _wrong(entry: MisplacedRelation) -> str:
+    if entry.reason == "floats":
+        return f"{entry.subject} in the air"
+    if entry.reason == "sunk-in":
+        return f"{entry.subject} partly inside {entry.object}"
+    return _relation(entry)
+
+
+def missing(answer: MissingAnswer) -> Iterator[str]:
+    """Say which objects are probably there beside the listed ones, and where."""
+    entries = [(one.listed_as or one.label, one.probability, _place(one)) for one in answer.missing]
+    yield from _split(entries, "Probably also there", "I am sure of no further object.")
+    if answer.more:
+        counts = (f"{one.label} (about {one.expected_count:.0f})" for one in answer.more[:MOST])
+        yield f"Probably more of: {', '.join(counts)}."
+
+
+def _place(entry: MissingObject) -> str:
+    place = next(iter(entry.placements), None)
+    if place is None or place.probability < _LIKELY_PLACE:
+        return ""
+    words = f"{PREPOSITIONS[place.relation]} {place.object}"
+    if place.offset is None:
+        return words
+    mean = place.offset.mean
+    x, y, z = (round(value, 2) + 0.0 for value in (mean.x, mean.y, mean.z))
+    return f"{words}, at its centre + [{x}, {y}, {z}] m"
+
+
+def where(answer: WhereAnswer) -> Iterator[str]:
+    """Say in which rooms and at which places the thing may be."""
+    thing = answer.listed_as or answer.label
+    rooms = []
+    for room in answer.rooms:
+        spots = [spot for spot in answer.places if spot.room == room.room]
+        likely = [spot for spot in spots if spot.probability >= _LEAST_SPOT and spot.object]
+        places = (f"{_spot(spot)} {_number(spot.probability)}" for spot in likely[:_MOST_SPOTS])
+        rooms.append((room.room, room.probability, ", ".join(places)))
+    entries = [room for room in rooms if room[1] >= MENTIONED]
+    yield from _split(entries, f"{thing} is probably in", f"I am not sure where {thing} is.")
+    yield f"In none of these rooms: {_number(answer.not_here)}."
+
+
+def _spot(spot: Spot) -> str:
+    if spot.is_listed or spot.relation is None:
+        return f"seen there as {spot.object}"
+    return f"{PREPOSITIONS[spot.relation]} {spot.object}"
+
+
+def rooms(answer: RoomsAnswer, objects: Collection[str]) -> Iterator[str]:
+    """Say which room has these objects, or in which rooms a single object is."""
+    entries = [
+        (" or ".join(one.listed_as or [one.room_type]), one.probability, "")
+        for one in answer.room_types
+        if one.probability >= MENTIONED
+    ]
+    if len(objects) > 1:
+        yield from _split(entries, "This is probably", "I am not sure which room this is.")
+    else:
+        (thing,) = objects
+        yield from _split(entries, f"{thing} is usually in", f"{thing} may be in many rooms.")
+
+
+def relations(answer: RelationsAnswer) -> Iterator[str]:
+    """Say how the objects stand to each other, and which known relation is unusual."""
+    known = [one for one in answer.relations if one.observed]
+    if known:
+        yield f"Known: {', '.join(map(_relation, known[:MOST]))}."
+    odd = [(_relation(one), one.expected, "") for one in known if one.expected is not None]
+    yield from _facts("Known, but unusual", [one for one in odd if one[1] < MENTIONED])
+    others = [(_relation(one), one.probability, "") for one in answer.relations if not one.observed]
+    yield from _split(others, "Likely", f"I am sure of no {'other ' * bool(known)}relation.")
+
+
+def imagined(answer: GenerateAnswer) -> Iterator[str]:
+    """Say how often sampled rooms have which objects and places."""
+    words, total = answer.listed_as or {}, len(answer.scenes)
+    kinds = Counter(one.room_type or "unknown" for one in answer.scenes)
+    things = Counter(words.get(name, name) for one in answer.scenes for name in one.objects)
+    # Left and front of single samples are as random as the viewer.
+    places = Counter(
+        (words.get(r.subject, r.subject), PREPOSITIONS[r.relation], words.get(r.object, r.object))
+        for one in answer.scenes
+        for r in one.relations
+        if r.relation not in ("left", "right", "front", "behind")
+    )
+    yield f"I imagined {total} rooms, and give the share of them."
+    yield from _facts("Kind of room", [(name, n / total, "") for name, n in kinds.most_common(3)])
+    yield from _split(
+        [(name, n / total, "") for name, n in things.most_common(2 * MOST)],
+        *("Usual objects", "No object is in most of them."),
+    )
+    common = places.most_common(MOST)
+    yield from _facts("Places", [(" ".join(names), n / total, "") for names, n in common])
+
+
+def _relation(entry: ScoredRelation) -> str:
+    return f"{entry.subject} {PREPOSITIONS[entry.relation]} {entry.object}"
+
+
+def _split(facts: Iterable[Fact], likely: str, unsure: str) -> Iterator[str]:
+    """Return likely facts, then possible ones. Without a likely fact, first state the doubt."""
+    facts = list(facts)
+    sure = [fact for fact in facts if fact[1] >= LIKELY]
+    yield from _facts(likely, sure)
+    if not sure:
+        yield unsure
+    yield from _facts("Possible", [fact for fact in facts if fact[1] < LIKELY])
+
+
+def _facts(lead: str, facts: Collection[Fact]) -> Iterator[str]:
+    if facts:
+        listed = [
+            f"{name} ({'; '.join(filter(None, (_number(probability), note)))})"
+            for name, probability, note in list(facts)[:MOST]
+        ]
+        yield f"{lead}: {', '.join(listed)}."
+
+
+def _number(probability: float) -> str:
+    if probability > 0.99:
+        return ">0.99"
+    return "<0.01" if probability < 0.01 else f"{probability:.2f}"
+
+
+def failure(error: ClientError) -> str:
+    """Return an error of a client as one sentence, which says what to do."""
+    if isinstance(error, InvalidRequestError):
+        return f"Correct the arguments: {error}."
+    if isinstance(error, UnreachableError):
+        return f"The scene service does not answer: start it, or correct its address ({error})."
+    if isinstance(error, DeadlineError):
+        return "The scene service took too long: ask again, or about fewer objects."
+    if not isinstance(error, ProblemError):
+        return str(error)
+    if error.status == 401:
+        return "The scene service wants another API key: correct SCENE_API_KEY or the X-API-Key."
+    if error.status in (429, 503):
+        return "The scene service is busy or not ready: ask again in some seconds."
+    if error.errors:
+        faults = "; ".join(
+            one.message + (f" (did you mean {', '.join(one.suggestions)}?)" * bool(one.suggestions))
+            for one in error.errors[:MOST]
+        )
+        is_word = error.type == "/problems/unknown-labels"
+        return f"{'Use another word' if is_word else 'Correct the arguments'}: {faults}."
+    return f"The scene service refused the question: {error.title} ({error.detail})"
