@@ -5,10 +5,11 @@ The command writes errors to standard error. The help text of `app` lists the ex
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -20,7 +21,7 @@ from pydantic import BaseModel
 from rich.console import Console, RenderableType
 from typer.core import TyperGroup
 
-from scene_client import __version__, phrases, tables
+from scene_client import __version__, mcp_server, phrases, planner, tables
 from scene_client.errors import (
     ClientError,
     DeadlineError,
@@ -425,6 +426,46 @@ def ready(context: typer.Context) -> None:
         client.check_ready()
 
 
+# ------------------------------------------------------------------------------------ planners
+
+
+@app.command()
+def mcp(
+    context: typer.Context,
+    http: Annotated[
+        int | None,
+        typer.Option(
+            metavar="PORT",
+            min=0,
+            max=65535,
+            help="Serve HTTP at http://127.0.0.1:PORT/mcp. The API key of each MCP request is "
+            "passed on to the service.",
+            show_default="stdio",
+        ),
+    ] = None,
+    schemas: Annotated[
+        planner.Vendor | None,
+        typer.Option(help="Only print the tools as JSON, in the form of this vendor."),
+    ] = None,
+) -> None:
+    """Serve tools for planners with a language model (Model Context Protocol)."""
+    if schemas is not None:
+        print(json.dumps(planner.schemas(schemas), indent=2))
+        return
+    options: Options = context.obj
+    if options.conventions:
+        _fail("the tools take positions in metres and sizes of boxes around their centre only")
+    with _exit_on_error(), options.client(_api_key()) as client:
+        if http is None:
+            mcp_server.serve_stdio(lambda _: nullcontext(client))
+        elif options.store is not None:
+            mcp_server.serve_http(lambda _: nullcontext(client), http)
+        else:
+            # The key of this process is not for every program of the machine.
+            key = mcp_server.api_key
+            mcp_server.serve_http(lambda headers: options.client(key(headers)), http)
+
+
 # ------------------------------------------------------------------------------------ the scene
 
 
@@ -493,7 +534,7 @@ def _exit_on_error() -> Iterator[None]:
         _fail(f"the service cannot be reached: {error}", UNREACHABLE)
     except DeadlineError as error:
         _fail(str(error), LATE)
-    except (InvalidRequestError, ImportError) as error:
+    except (InvalidRequestError, ImportError, OSError) as error:
         _fail(str(error))
     except ClientError as error:
         _fail(str(error), FAILED)
