@@ -128,7 +128,7 @@ class FindOutOfPlace(_SceneTool):
     """Find the objects of a room that do not belong there, or that are in a wrong place. Use it
     for "is anything odd here?", and before tidying up."""
 
-    name: ClassVar = "find_out_of_place"
+    name: ClassVar[str] = "find_out_of_place"
 
     def answer(self, client: Client) -> str:
         """Return the objects that do not belong, and those in wrong places."""
@@ -140,7 +140,7 @@ class SuggestMissing(_SceneTool):
     """Suggest the objects that a room probably has or lacks beside the listed ones, and where each
     would be. Use it for "what is missing?", "what else is there?" and "what belongs on a desk?"."""
 
-    name: ClassVar = "suggest_missing"
+    name: ClassVar[str] = "suggest_missing"
 
     at: Place | None = None
     """ask only about this place, such as "on-top desk"; the object must be in `objects`"""
@@ -160,7 +160,7 @@ class LocateObject(Tool):
     """Find where a thing is, or where it belongs, in a home whose rooms are known. Use it for
     "where are my keys?", to search for a thing, and to put a thing away."""
 
-    name: ClassVar = "locate_object"
+    name: ClassVar[str] = "locate_object"
 
     thing: Label
     """the wanted thing, as one common word such as "mug\""""
@@ -186,7 +186,7 @@ class IdentifyRoom(Tool):
     """Tell which kind of room has these objects. For a single object, tell in which kinds of rooms
     it usually is. Use it for "which room is this?" and "in which room do people keep scissors?"."""
 
-    name: ClassVar = "identify_room"
+    name: ClassVar[str] = "identify_room"
 
     objects: Labels
     """the objects of one room in plain words, or one object"""
@@ -203,7 +203,7 @@ class RelateObjects(_SceneTool):
     """Tell how the objects of a room probably stand to each other: what is on, in, under or beside
     what. Use it for "where in the room is the book?" and to check relations."""
 
-    name: ClassVar = "relate_objects"
+    name: ClassVar[str] = "relate_objects"
 
     def answer(self, client: Client) -> str:
         """Return the likely relations, and those that are unusual."""
@@ -215,7 +215,7 @@ class ImagineRoom(Tool):
     """Imagine a typical room of a kind: which objects it has, and where they stand. Use it for
     "what does a dentist's room look like?"."""
 
-    name: ClassVar = "imagine_room"
+    name: ClassVar[str] = "imagine_room"
 
     room_type: Label | None = None
     """kind of the room, such as "kitchen" or "dental office\""""
