@@ -173,11 +173,16 @@ ENTRIES: dict[str, Any] = {
             {"kitchen": 0.3, "office": 0.2},
             "I am not sure which room this is. Possible: kitchen (0.",
         ),
-        ({"kitchen": 0.04}, "I am not sure which room this is."),
+        (
+            {"kitchen": 0.2},
+            "I am not sure which room this is. Possible: kitchen (0.20). The objects tell",
+        ),
     ],
 )
 def test_a_flat_distribution_is_no_fact(peer: Any, types: dict[str, float], sentences: str) -> None:
+    because = [{"object": "pan", "log_odds_change": 1.2}]
     found = [{"room_type": name, "probability": share} for name, share in types.items()]
+    found[0] |= {"because": because if len(types) > 1 else []}
     body = json.dumps(ENTRIES | {"room_types": found}).encode()
     with Client(peer(answering(body)).url) as client:
         answer = planner.call(client, "identify_room", {"objects": ["pan", "pot"]})
@@ -192,6 +197,7 @@ def outlier(name: str, probability: float, **fields: Any) -> dict[str, Any]:
 
 def test_every_verdict_and_every_warning_is_said(peer: Any) -> None:
     wrong = {"subject": "pan", "relation": "above", "object": "floor", "probability": 0.999}
+    doubt = {"subject": "mug", "relation": "on-top", "object": "bed", "probability": 0.12}
     rooms = [{"room_type": "bar", "objects": ["pan"]}, {"room_type": "gym", "objects": ["cat"]}]
     several = {"code": "several-rooms", "message": "", "objects": [], "rooms": rooms}
     rare = {"code": "not-judged", "message": "too few scenes", "objects": ["odd"]}
@@ -203,7 +209,7 @@ def test_every_verdict_and_every_warning_is_said(peer: Any) -> None:
         outlier("pan", 0.04),
         outlier("cat", 0.0, log_odds=None),
     ]
-    misplaced = [wrong | {"is_misplaced": True, "reason": "floats"}]
+    misplaced = [wrong | {"is_misplaced": True, "reason": "floats"}, doubt]
     answer = {"outliers": outliers, "misplaced": misplaced, "warnings": [several, rare]}
     body = json.dumps(ENTRIES | answer).encode()
     with Client(peer(answering(body)).url) as client:
@@ -214,7 +220,7 @@ def test_every_verdict_and_every_warning_is_said(peer: Any) -> None:
         "Out of place: toilet (0.97; usually with sink, shower)",
         "In a wrong place: pan in the air (>0.99)",
         "Probably wrong detections: ghost (0.90)",
-        "Perhaps out of place, but no alarm: mug (0.30)",
+        "Perhaps wrong, but no alarm: mug (0.30), mug on top of bed (0.12)",
         "Not judged, as it may be anywhere or I know it too little: cat",
         "All else fits (each at most 0.04).",
     ]

@@ -153,7 +153,7 @@ class SuggestMissing(_SceneTool):
         if "only" in fields:
             fields["candidates"] = fields.pop("only")
         found = client.missing(**fields, top_k=8)
-        return sentences.text(found, sentences.missing(found))
+        return sentences.text(found, sentences.missing(found, only=self.only is not None))
 
 
 class LocateObject(Tool):

@@ -34,7 +34,7 @@ MENTIONED: Final = 0.05
 """Minimum probability of a possible room or relation."""
 MOST: Final = 12
 """Maximum number of entries of a list."""
-_DOUBTFUL: Final = 0.2  # minimum probability of an object to name it without an alarm
+_DOUBTFUL: Final = 0.1  # minimum probability of a fault that is named without an alarm
 _LIKELY_PLACE: Final = 0.25  # minimum probability of the place of a missing object
 _MOST_SPOTS: Final = 4  # maximum number of places in a room
 _LEAST_SPOT: Final = 0.01
@@ -55,7 +55,7 @@ def text(answer: Answer, sentences: Iterable[str], rooms: Collection[str] = ()) 
 
 
 def _words(answer: Answer, rooms: Collection[str]) -> Iterator[str]:
-    hint = "a commoner word may help"
+    hint = "ask again with a commoner word, if there is one"
     if ignored := [f'"{name}"' for name in answer.ignored if name not in rooms]:
         pronoun = "it" if len(ignored) == 1 else "them"
         yield f"I do not know {', '.join(ignored)} and left {pronoun} out ({hint})."
@@ -65,7 +65,7 @@ def _words(answer: Answer, rooms: Collection[str]) -> Iterator[str]:
         if entry.rule in ("spelling", "head"):
             yield f'I read "{entry.label}" as {entry.class_} (a guess).'
         elif entry.rule == "meaning":
-            guess = f"near {entry.class_} (a guess; {hint})"
+            guess = f"near {entry.class_} (a weak guess; {hint})"
             yield f'I know "{entry.label}" only by its meaning, {guess}.'
 
 
@@ -96,11 +96,13 @@ def out_of_place(answer: OutliersAnswer) -> Iterator[str]:
         elif one.object not in warned:
             group = "doubtful" if one.probability >= _DOUBTFUL else "fitting"
             groups[group].append((one.object, one.probability, ""))
-    moved = [(_wrong(one), one.probability, "") for one in answer.misplaced if one.is_misplaced]
+    places = [(one.is_misplaced, (_wrong(one), one.probability, "")) for one in answer.misplaced]
+    moved = [place for is_alarm, place in places if is_alarm]
+    groups["doubtful"] += [one for is_alarm, one in places if not is_alarm and one[1] >= _DOUBTFUL]
     yield from _facts("Out of place", groups["odd"])
     yield from _facts("In a wrong place", moved)
     yield from _facts("Probably wrong detections", groups["unreal"])
-    yield from _facts("Perhaps out of place, but no alarm", groups["doubtful"])
+    yield from _facts("Perhaps wrong, but no alarm", groups["doubtful"])
     if unknown:
         yield f"Not judged, as it may be anywhere or I know it too little: {', '.join(unknown)}."
     if fitting := groups["fitting"]:
@@ -117,10 +119,16 @@ def _wrong(entry: MisplacedRelation) -> str:
     return _relation(entry)
 
 
-def missing(answer: MissingAnswer) -> Iterator[str]:
-    """Say which objects are probably there beside the listed ones, and where."""
+def missing(answer: MissingAnswer, *, only: bool) -> Iterator[str]:
+    """Say which objects are probably there beside the listed ones, and where.
+
+    Args:
+        answer: the answer.
+        only: whether the request names the candidates.
+    """
     entries = [(one.listed_as or one.label, one.probability, _place(one)) for one in answer.missing]
-    yield from _split(entries, "Probably also there", "I am sure of no further object.")
+    unsure = "None of these is probable." if only else "I am sure of no further object."
+    yield from _split(entries, "Probably also there", unsure)
     if answer.more:
         counts = (f"{one.label} (about {one.expected_count:.0f})" for one in answer.more[:MOST])
         yield f"Probably more of: {', '.join(counts)}."
@@ -148,7 +156,7 @@ def where(answer: WhereAnswer) -> Iterator[str]:
         places = (f"{_spot(spot)} {_number(spot.probability)}" for spot in likely[:_MOST_SPOTS])
         rooms.append((room.room, room.probability, ", ".join(places)))
     entries = [room for room in rooms if room[1] >= MENTIONED]
-    yield from _split(entries, f"{thing} is probably in", f"I am not sure where {thing} is.")
+    yield from _split(entries, f"Probable place of {thing}", f"I am not sure about {thing}.")
     yield f"In none of these rooms: {_number(answer.not_here)}."
 
 
@@ -170,6 +178,8 @@ def rooms(answer: RoomsAnswer, objects: Collection[str]) -> Iterator[str]:
     else:
         (thing,) = objects
         yield from _split(entries, f"{thing} is usually in", f"{thing} may be in many rooms.")
+    if not any(one.because for one in answer.room_types):
+        yield "The objects tell little about the room, so these are the commonest rooms."
 
 
 def relations(answer: RelationsAnswer) -> Iterator[str]:
@@ -201,8 +211,8 @@ def imagined(answer: GenerateAnswer) -> Iterator[str]:
         [(name, n / total, "") for name, n in things.most_common(2 * MOST)],
         *("Usual objects", "No object is in most of them."),
     )
-    common = places.most_common(MOST)
-    yield from _facts("Places", [(" ".join(names), n / total, "") for names, n in common])
+    common = [(" ".join(names), n / total, "") for names, n in places.most_common(MOST)]
+    yield from _facts("Places", [place for place in common if place[1] > MENTIONED])
 
 
 def _relation(entry: ScoredRelation) -> str:
