@@ -461,7 +461,7 @@ def mcp(
         elif options.store is not None:
             mcp_server.serve_http(lambda _: nullcontext(client), http)
         else:
-            # The key of this process is not for every program of the machine.
+            # The key of this process is for its own user, and not for each client of the port.
             key = mcp_server.api_key
             mcp_server.serve_http(lambda headers: options.client(key(headers)), http)
 

@@ -118,8 +118,7 @@ class _SceneTool(Tool):
     objects: Objects
     """the objects of one room, in plain words; with positions only if they are measured"""
     relations: Relations | None = None
-    """known relations, such as "lamp on-top desk": left, right, front, behind, on-top, under,
-    above, below, inside, contains"""
+    """known relations, such as "lamp on desk" or "shoes under bed", as texts"""
     room_type: Label | None = None
     """kind of the room, only if it is certain"""
 
@@ -145,7 +144,7 @@ class SuggestMissing(_SceneTool):
     at: Place | None = None
     """ask only about this place, such as "on-top desk"; the object must be in `objects`"""
     only: Labels | None = None
-    """ask only about these things, for example ["kettle"] for "is there a kettle?\""""
+    """ask only about these things, such as ["kettle"] to learn if there is a kettle"""
 
     def answer(self, client: Client) -> str:
         """Return the likely missing objects with their places."""
@@ -157,17 +156,17 @@ class SuggestMissing(_SceneTool):
 
 
 class LocateObject(Tool):
-    """Find where a thing is, or where it belongs, in a home whose rooms are known. Use it for
-    "where are my keys?", to search for a thing, and to put a thing away."""
+    """Find where a thing probably is, or usually lies, in a home whose rooms are known. Use it for
+    "where are my keys?", to search for a thing, and to choose a place for a thing."""
 
     name: ClassVar[str] = "locate_object"
 
     thing: Label
-    """the wanted thing, as one common word such as "mug\""""
+    """the wanted thing in plain words, such as "mug" or "can opener", without details"""
     rooms: Home
     """the rooms of the home with their objects, such as {"kitchen": ["fridge", "counter"]}"""
     searched: Places | None = None
-    """places already searched in vain: "bathroom", or "kitchen: counter" for one object"""
+    """places already searched without success: "bathroom", or "kitchen: counter" for one object"""
 
     def answer(self, client: Client) -> str:
         """Return the likely rooms and places of the thing."""
@@ -218,7 +217,7 @@ class ImagineRoom(Tool):
     name: ClassVar[str] = "imagine_room"
 
     room_type: Label | None = None
-    """kind of the room, such as "kitchen" or "dental office\""""
+    """kind of the room in plain words: "kitchen", "dental office" and so on"""
     objects: Labels | None = None
     """objects that the room must have"""
 

@@ -67,6 +67,8 @@ def _words(answer: Answer, rooms: Collection[str]) -> Iterator[str]:
         elif entry.rule == "meaning":
             guess = f"near {entry.class_} (a weak guess; {hint})"
             yield f'I know "{entry.label}" only by its meaning, {guess}.'
+        elif entry.class_ not in entry.label.lower():
+            yield f'I read "{entry.label}" as {entry.class_}.'
 
 
 def _warnings(answer: Answer) -> Iterator[str]:
@@ -162,7 +164,7 @@ def where(answer: WhereAnswer) -> Iterator[str]:
 
 def _spot(spot: Spot) -> str:
     if spot.is_listed or spot.relation is None:
-        return f"seen there as {spot.object}"
+        return f"already seen: {spot.object}"
     return f"{PREPOSITIONS[spot.relation]} {spot.object}"
 
 
@@ -255,7 +257,7 @@ def failure(error: ClientError) -> str:
     if not isinstance(error, ProblemError):
         return str(error)
     if error.status == 401:
-        return "The scene service wants another API key: correct SCENE_API_KEY or the X-API-Key."
+        return "The scene service wants another API key: set SCENE_API_KEY, or over HTTP X-API-Key."
     if error.status in (429, 503):
         return "The scene service is busy or not ready: ask again in some seconds."
     if error.errors:
