@@ -177,7 +177,7 @@ ENTRIES: dict[str, Any] = {
         ),
         (
             {"kitchen": 0.2},
-            "I am not sure which room this is. Possible: kitchen (0.20). The objects tell",
+            "I am not sure which room this is. Possible: kitchen (0.20). No object",
         ),
     ],
 )

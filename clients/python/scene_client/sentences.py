@@ -181,7 +181,7 @@ def rooms(answer: RoomsAnswer, objects: Collection[str]) -> Iterator[str]:
         (thing,) = objects
         yield from _split(entries, f"{thing} is usually in", f"{thing} may be in many rooms.")
     if not any(one.because for one in answer.room_types):
-        yield "The objects tell little about the room, so these are the commonest rooms."
+        yield "No object points clearly to one of these rooms."
 
 
 def relations(answer: RelationsAnswer) -> Iterator[str]:
