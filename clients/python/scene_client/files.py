@@ -217,8 +217,8 @@ def _names(text: str) -> Any:
 
 
 def _member(entry: str, name: str) -> str:
-    found = re.search(rf"\b{name}\s*:\s*[\"']?([^\"'\n]+)", entry)
-    return found[1].strip() if found else ""
+    found = re.search(rf"\b{name}\s*:\s*(?:\"([^\"]*)\"|'([^']*)'|(\S+))", entry)
+    return next(filter(None, found.groups()), "") if found else ""
 
 
 def _without_comment(label: str) -> str:
