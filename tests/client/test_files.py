@@ -1,17 +1,20 @@
 """Scenes from files of detectors, tools and simulators, and the reasons for refusals."""
 
 import json
+import sys
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.writer import Writer
 from typer.testing import CliRunner
 
 import scene_client
+from scene_client import parsing
 from scene_client.command import app
-from scene_client.files import MAX_FILE, is_file
+from scene_client.files import MAX_FILE, is_file, scenes_of
 from scene_client.ros_fields import MessageError
 from scene_client.schemas import MissingRequest
 from tests.chaos.corpus import places, replaced
@@ -167,3 +170,81 @@ def test_the_command_prints_few_notes(url: str, tmp_path: Path) -> None:
     done = CliRunner().invoke(app, line)
     assert (done.exit_code, done.stdout) == (2, "")
     assert done.stderr == f"{path} has no object for a request: class '12' has no label\n"
+
+
+def recorded(path: Path, messages: list[tuple[str, str, dict[str, Any]]]) -> None:
+    """Write messages (topic, schema, message) in JSON to a recording."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channels = {
+            topic: writer.register_channel(topic, "json", writer.register_schema(kind, "", b""))
+            for topic, kind, _ in messages
+        }
+        for time, (topic, _, message) in enumerate(messages):
+            writer.add_message(channels[topic], time, json.dumps(message).encode(), time)
+        writer.finish()
+
+
+def test_a_recording_has_a_scene_for_each_message(tmp_path: Path) -> None:
+    path = tmp_path / "bag.mcap"
+    entity = json.loads(EXAMPLES["foxglove.json"].text)
+    transform = ("/tf", "foxglove.FrameTransform", {"translation": {"x": 1}})
+    recorded(path, [transform, ("/seen", "foxglove.SceneUpdate", entity), transform])
+    fields = scene_client.from_file(path)
+    assert rounded(dict(fields)) == EXAMPLES["foxglove.json"].request
+    depth = json.loads(EXAMPLES["detection3d.json"].text)
+    recorded(path, [("/a", "x", entity), ("/b", "y", depth), ("/b", "y", depth)])
+    with pytest.raises(MessageError, match=r"3 scenes \(/a:1, /b:1, /b:2\)"):
+        scene_client.from_file(path)
+    assert scene_client.from_file(f"{path}:/b:2")["objects"][0]["label"] == "rug"
+    recorded(path, [transform])
+    with pytest.raises(MessageError, match="without detections; its topics are /tf"):
+        scene_client.from_file(path)
+
+
+def test_a_recording_with_a_huge_chunk_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "bag.mcap"
+    recorded(path, [("/a", "x", {"text": "x" * 10_000})])
+    assert path.stat().st_size < 2000
+    monkeypatch.setattr(parsing, "MOST_MESSAGES", 5000)
+    with pytest.raises(MessageError, match="more than 5000 bytes"):
+        scene_client.from_file(path)
+
+
+@pytest.mark.parametrize(("name", "package"), [("echo.yaml", "yaml"), ("a.mcap", "mcap")])
+def test_a_missing_package_is_named_with_the_command(
+    name: str, package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorded(tmp_path / "a.mcap", [])
+    (tmp_path / "echo.yaml").write_text(EXAMPLES["echo.yaml"].text)
+    for module in [one for one in sys.modules if one.partition(".")[0] == package]:
+        monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.setitem(sys.modules, f"{package}.stream_reader", None)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(MessageError, match=f"the package {package}: pip install 'scene-client"):
+        scene_client.from_file(tmp_path / name)
+
+
+def test_an_existing_file_is_a_file_whatever_its_name(tmp_path: Path) -> None:
+    path = tmp_path / "seen.det"
+    path.write_text(EXAMPLES["hf_batch.json"].text)
+    assert is_file(str(path))
+    assert is_file(f"{path}:2")
+    assert scene_client.from_file(f"{path}:2")["objects"][0]["label"] == "bed"
+
+
+def test_a_text_may_be_in_utf_16(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("label;x;y;z\nStuhl;1,5;2,0;0,4\n", "utf-16")
+    (thing,) = scene_client.from_file(path)["objects"]
+    assert (thing["label"], thing["position"]) == ("Stuhl", {"x": 1.5, "y": 2.0, "z": 0.4})
+
+
+def test_a_yaml_text_has_a_scene_for_each_document(tmp_path: Path) -> None:
+    path = tmp_path / "echo.yaml"
+    path.write_text(EXAMPLES["echo.yaml"].text * 2)
+    assert len(scenes_of(path.read_bytes())) == 2
+    assert rounded(dict(scene_client.from_file(f"{path}:2"))) == EXAMPLES["echo.yaml"].request

@@ -25,15 +25,26 @@ class ClientError(Exception):
         return copyreg.__newobj__, (type(self), *self.args), self.__dict__  # type: ignore[attr-defined]
 
 
+_LONGEST_LINE: Final = 270
+"""Maximum length of the errors in the text of an `InvalidRequestError` in characters."""
+
+
 class InvalidRequestError(ClientError, ValueError):
-    """The request is invalid. The client has not sent it.
+    """The request is invalid. The client has not sent it. The text contains the first errors.
 
     Attributes:
         errors: list of the errors. Each error has a location in the body of the request.
     """
 
     def __init__(self, errors: Sequence[FieldError]) -> None:
-        super().__init__("; ".join(_located_message(error) for error in errors))
+        line = ""
+        for shown, error in enumerate(errors):
+            longer = line + "; " * bool(line) + _located_message(error)
+            if line and len(longer) > _LONGEST_LINE:
+                line += f"; and {len(errors) - shown} more errors"
+                break
+            line = longer
+        super().__init__(line)
         self.errors = list(errors)
 
     @classmethod

@@ -73,7 +73,7 @@ def scenes_in(data: Any, label_map: LabelMap | None = None) -> dict[str, Reader]
     if form is None and _is_label_map(data):
         form = LABEL_MAP
     if form is None:
-        return {"": partial(_with_labels, data, label_map)}
+        return {"": partial(_with_labels, _request(data), label_map)}
     if "use" in form:
         raise MessageError(f"this is {form['name']}: {form['use']}")
     name, whole = form["name"], data
@@ -276,8 +276,8 @@ def _image_relations(annotated: list[Any], objects: list[Any]) -> list[list[str]
     return [[ids[first], "left", ids[second]] for first, second in pairs]
 
 
-def _with_labels(data: Any, label_map: LabelMap | None) -> SceneFields:
-    scene, labels, objects = _request(data), read_label_map(label_map), []
+def _with_labels(scene: dict[str, Any], label_map: LabelMap | None) -> SceneFields:
+    labels, objects = read_label_map(label_map), []
     for thing in scene["objects"]:
         label = thing.get("label") if isinstance(thing, dict) else thing
         if isinstance(label, str | int) and str(label).isdecimal():

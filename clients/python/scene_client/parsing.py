@@ -18,7 +18,9 @@ from scene_client.records import FIELDS, TABLE, Form, Rows, key_of
 from scene_client.ros_fields import MessageError
 
 _MOST_YAML: Final = 2**19  # bytes; PyYAML is slow
-_MOST_MESSAGES: Final = 2**26  # bytes of the messages in a file, after decompression
+MOST_MESSAGES: Final = 2**26
+"""Maximum size of a chunk of a recording after decompression in bytes."""
+
 _PART: Final = 2**16  # characters of XML
 _START: Final = 2000  # characters in which a refused format shows
 _BEFORE: Final = r"\s*(?:<\?xml[^>]*>\s*)?(?:<!--(?:(?!-->).)*-->\s*)?"
@@ -351,11 +353,11 @@ def _unpacked(chunk: Any) -> Any:
     """Return a chunk of a recording with the data as they are, which have a limit."""
     if chunk.compression == "zstd":
         stream = extra("zstandard").ZstdDecompressor().stream_reader(chunk.data)
-        data = stream.read(_MOST_MESSAGES + 1)
+        data = stream.read(MOST_MESSAGES + 1)
     elif chunk.compression == "lz4":
-        data = extra("lz4.frame").LZ4FrameDecompressor().decompress(chunk.data, _MOST_MESSAGES + 1)
+        data = extra("lz4.frame").LZ4FrameDecompressor().decompress(chunk.data, MOST_MESSAGES + 1)
     else:
         data = chunk.data
-    if len(data) > _MOST_MESSAGES:
-        raise MessageError(f"this is a recording with a chunk of more than {_MOST_MESSAGES} bytes")
+    if len(data) > MOST_MESSAGES:
+        raise MessageError(f"this is a recording with a chunk of more than {MOST_MESSAGES} bytes")
     return replace(chunk, data=data, compression="")
