@@ -16,6 +16,7 @@ from typing import Any, Final, TypeVar
 
 from scene_client.image_plane import left_pairs
 from scene_client.parsing import Xml
+from scene_client.paths import leads
 from scene_client.records import (
     FIELDS,
     FORMATS,
@@ -26,7 +27,6 @@ from scene_client.records import (
     Rows,
     read,
     records_of,
-    signs,
 )
 from scene_client.ros_fields import REMEDY, LabelMap, MessageError, read_label_map, unwrapped
 from scene_client.schemas import Detection
@@ -207,12 +207,18 @@ def _kind(data: Any) -> str:
     return f"a JSON {kind} with the fields {names}" if names else f"an empty JSON {kind}"
 
 
+def _signs(form: Form, data: Any) -> float:
+    """Return which part of the paths in `has` leads to a value."""
+    paths = form.get("has", ())
+    return sum(leads(path, data) for path in paths) / max(len(paths), 1)
+
+
 def _nearest(data: Any) -> str:
     """Return the name of the format with the most paths in data, and a path that is missing."""
-    form = max(FORMATS, key=lambda form: signs(form, data))
-    if not signs(form, data):
+    form = max(FORMATS, key=lambda form: _signs(form, data))
+    if not _signs(form, data):
         return ": send a list of objects with the field label, or a format of docs/clients.md"
-    lacking = next(path for path in form["has"] if not signs({"has": [path]}, data))
+    lacking = next(path for path in form["has"] if not leads(path, data))
     return f"; the nearest is {form['name']}, which also has {lacking.partition('|')[0][:60]}"
 
 

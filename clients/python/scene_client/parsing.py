@@ -14,6 +14,7 @@ from importlib import import_module
 from typing import Any, Final
 from xml.etree import ElementTree
 
+from scene_client.boxes import NUMBER
 from scene_client.records import FIELDS, TABLE, Form, Rows, key_of
 from scene_client.ros_fields import MessageError
 
@@ -24,7 +25,6 @@ MOST_MESSAGES: Final = 2**26
 _PART: Final = 2**16  # characters of XML
 _START: Final = 2000  # characters in which a refused format shows
 _BEFORE: Final = r"\s*(?:<\?xml[^>]*>\s*)?(?:<!--(?:(?!-->).)*-->\s*)?"
-_NUMBER: Final = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
 _FENCE: Final = re.compile(r"```(?:\w+)?[ \t]*\n(.*?)```", re.DOTALL)
 _ITEM: Final = re.compile(r"(?:[-*•+]|\d{1,3}[.)])[ \t]+(?=\S)")
 _YAML: Final = re.compile(r"(---\s|- |[\w./ -]{1,64}:(\s|$))")
@@ -230,7 +230,7 @@ def _is_no_label(label: str) -> bool:
 
 
 def _is_number(word: str) -> bool:
-    return _NUMBER.fullmatch(word) is not None or word.lower() in ("nan", "inf", "-inf")
+    return NUMBER.fullmatch(word) is not None or word.lower() in ("nan", "inf", "-inf")
 
 
 def _what_text(lines: list[str]) -> str:

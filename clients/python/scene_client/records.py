@@ -1,17 +1,7 @@
 """The reader of all formats in the table ``formats.json``: where labels, scores and boxes lie.
 
 A format has a name, paths that its data has (`has`), the path of its objects (`items`), and the
-paths of their fields. A path consists of steps with dots between them:
-
-    name    a member; a number is the index of an element
-    []      each element of a list (other data counts as a list of one)
-    *       each member; in the path of a field, the first one
-    ^       at the start: the object one [] or * further out; /: the whole data
-    @       the key of the object; within a path, the member with this key
-    ~       the first key
-    ?k=a+b  the first element whose member k is a or b; >k: the element with the largest member k
-
-"a|b" is the first path that leads to a value, and "x,y,z" are several values. The names in `fields`
+paths of their fields; see `scene_client.paths`. "x,y,z" are several values. The names in `fields`
 find the fields that a format does not name. So one reader also reads tables and lists of records.
 """
 
@@ -21,17 +11,15 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping
-from functools import cached_property, lru_cache
+from functools import cached_property
 from importlib.resources import files
 from typing import Any, Final
 
-from scene_client.frames import Conventions, quaternion_of
-from scene_client.image_plane import Box, upright_box
-from scene_client.ros_fields import MessageError, frame_of, members, number, take, text, time_of
+from scene_client.boxes import IMAGE, NUMBER, SOLID, image, numeric, numerics, solid
+from scene_client.image_plane import Box
+from scene_client.paths import LOOKED_AT, Chain, each, get, leads
+from scene_client.ros_fields import frame_of, members, number, take, text, time_of
 from scene_client.sightings import Note, Reason, Seen, Sighting, Solid
-
-Chain = tuple[tuple[Any, Any], ...]
-"""Pairs (key, node): the whole data, then the objects of each [] or * of a path."""
 
 Form = dict[str, Any]
 """An entry of the table of formats."""
@@ -46,13 +34,8 @@ FIELDS: Final[dict[str, Any]] = TABLE["fields"]
 """Usual names of each kind of field, in the form of `key_of`."""
 
 _CARRIES: Final = re.compile(FIELDS["carries"])
-_NUMBER: Final = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
-_NONE: Final = frozenset(("", "nan", "null", "none", "n/a"))
 _MOST_NAMES: Final = 8  # of unread fields in a note
-_LOOKED_AT: Final = 64  # number of records whose fields are looked through
 _TURN: Final = 6.3  # radians; a larger yaw is in degrees
-_IMAGE: Final = ("corners", "rows", "corner", "centre", "points", "spans", "radii")
-_SOLID: Final = ("position", "size", "turn", "axes", "matrix", "span", "yaw", "degrees", "about")
 
 
 class Rows(list[dict[str, Any]]):
@@ -63,97 +46,9 @@ class Rows(list[dict[str, Any]]):
         self.form, self.first = form, first
 
 
-# ---------------------------------------------------------------------------------------- paths
-
-
-@lru_cache(maxsize=1024)
-def _paths(path: str) -> list[list[str]]:
-    return [one.split(".") if one else [] for one in path.split("|")]
-
-
-def each(data: Any, path: str) -> Iterator[Chain]:
-    """Yield the objects of data at the first path of "a|b" that leads to one."""
-    for steps in _paths(path):
-        found = _each(((None, data),), data, steps)
-        if (first := next(found, None)) is not None:
-            yield first
-            yield from found
-            return
-
-
-def _each(chain: Chain, node: Any, steps: list[str]) -> Iterator[Chain]:
-    entries: Any
-    for place, step in enumerate(steps):
-        if step == "[]":
-            is_list = isinstance(node, list | tuple)
-            entries = enumerate(node) if is_list else () if node is None else ((0, node),)
-        elif step == "*":
-            entries = node.items() if isinstance(node, Mapping) else ()
-        else:
-            node = _step(node, step)
-            continue
-        for entry in entries:
-            yield from _each((*chain, entry), entry[1], steps[place + 1 :])
-        return
-    if node is not None:
-        yield chain if node is chain[-1][1] else (*chain, (None, node))
-
-
-def get(chain: Chain, path: str) -> Any:
-    """Return the value at the first path of "a|b" that leads to one, or None."""
-    for steps in _paths(path):
-        first = steps[0] if steps else ""
-        outer = len(chain) if first[:1] == "/" else 1 + first.count("^")
-        key, node = chain[-min(outer, len(chain))]
-        if steps[-1:] == ["@"]:
-            return key
-        for place, step in enumerate(steps):
-            step = step.lstrip("^/")
-            if step == "[]":
-                entries = node if isinstance(node, list | tuple) else ()
-                rest = ".".join(steps[place + 1 :])
-                return [get(((None, entry),), rest) for entry in entries]
-            node = _step(node, str(chain[-1][0]) if step == "@" else step)
-            if node is None:
-                break
-        if node is not None and node != "":
-            return node
-    return None
-
-
-def _step(node: Any, step: str) -> Any:
-    """Return the part of a node that a step leads to, or None."""
-    if step[:1] == ">":
-        if not isinstance(node, list | tuple):
-            raise MessageError(f"the {step[1:]}s must be in a list")
-        ranks = {n: number(_scored(one, step[1:])) for n, one in enumerate(node)}
-        finite = {n: rank for n, rank in ranks.items() if rank is not None}
-        return node[max(finite, key=finite.__getitem__)] if finite else None
-    if step[:1] == "?":
-        name, _, wanted = step[1:].partition("=")
-        entries = node if isinstance(node, list | tuple) else ()
-        return next((one for one in entries if str(take(one, name)) in wanted.split("+")), None)
-    if step in ("*", "~"):
-        pairs = node.items() if isinstance(node, Mapping) else ()
-        return next((pair[step == "*"] for pair in pairs), None)
-    if isinstance(node, list | tuple):
-        return node[int(step)] if step.isdecimal() and int(step) < len(node) else None
-    return take(node, step) if step else node
-
-
-def _scored(result: Any, name: str) -> Any:
-    """Return a member of a result of vision_msgs, whose layout differs between versions of ROS."""
-    return take(take(result, "hypothesis") or result, name)
-
-
-def signs(form: Form, data: Any) -> float:
-    """Return which part of the paths in `has` leads to a value. A path may end in "=value"."""
-    paths, found = form.get("has", ()), 0
-    for path in paths:
-        path, _, wanted = path.partition("=")
-        chain = next(each(data, path), None)
-        found += chain is not None and (not wanted or str(chain[-1][1]) == wanted)
-    return found / len(paths) if paths else 0.0
+def matches(form: Form, data: Any) -> bool:
+    """Return whether all paths in `has` lead to a value."""
+    return "has" in form and all(leads(path, data) for path in form["has"])
 
 
 def spot(chain: Chain, spec: Any) -> Any:
@@ -230,109 +125,6 @@ class Record:
                 yield name
 
 
-def numeric(value: Any, what: str) -> float:
-    """Return a number, also of text; NaN for other values.
-
-    Raises:
-        MessageError: the value is text without a number.
-    """
-    if isinstance(value, str):
-        value = value.strip()
-        if _NUMBER.fullmatch(value):
-            return float(value)
-        if value.lower() not in _NONE:
-            raise MessageError(f"{what}: {value[:40]!r} is not a number")
-    return math.nan if (found := number(value)) is None else found
-
-
-def numerics(value: Any, what: str) -> list[float]:
-    """Return the numbers of a list, of nested lists, of "x,y;x,y", or of the members x, y, z, w."""
-    if isinstance(value, str) and "," in value:
-        value = value.replace(";", ",").split(",")
-    if hasattr(value, "tolist"):  # an array of numpy or of the standard library
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        return [part for one in value for part in numerics(one, what)]
-    if value is None or isinstance(value, str | float | int):
-        return [numeric(value, what)]
-    axes = [(axis, take(value, axis)) for axis in "xyzw"]
-    return [numeric(part, what) for axis, part in axes if axis in "xy" or part is not None]
-
-
-# ---------------------------------------------------------------------------------------- boxes
-
-
-def image(kind: str, values: Any, what: str, theta: float = 0.0) -> Box | None:
-    """Return the upright box around a box in an image that is rotated by ``theta`` radians."""
-    if kind == "spans":
-        xs, ys = (numerics(one, what) for one in values)
-    else:
-        several = numerics(values, what)
-        xs, ys = several[::2], several[1::2]
-        if kind == "rows":  # y before x
-            xs, ys = ys, xs
-        if kind != "points" and len(several) != 4:
-            return None
-    if not xs or not all(map(math.isfinite, xs + ys)):
-        return math.nan, math.nan, math.nan, math.nan
-    if kind in ("corner", "centre", "radii"):
-        (x, width), (y, height) = xs, ys
-        if kind == "radii":
-            width, height = 2 * width, 2 * height
-        if kind == "corner":  # the rotation is about the corner
-            cos, sin = math.cos(theta) / 2, math.sin(theta) / 2
-            x, y = x + cos * width - sin * height, y + sin * width + cos * height
-    else:
-        x, y, width, height = sum(_span(xs)) / 2, sum(_span(ys)) / 2, _side(xs), _side(ys)
-    return upright_box((x, y), (width, height), theta)
-
-
-def _span(values: list[float]) -> tuple[float, float]:
-    return min(values), max(values)
-
-
-def _side(values: list[float]) -> float:
-    return max(values) - min(values)
-
-
-def solid(form: Form, values: Mapping[str, Any], what: str) -> Solid | None:
-    """Return a box with a position, with z up if the format has another convention."""
-    parts = {name: numerics(value, what) for name, value in values.items()}
-    if len(matrix := parts.get("matrix", [])) == 16:  # the columns, one after another
-        parts |= {"position": matrix[12:15], "axes": matrix[0:3] + matrix[4:7] + matrix[8:11]}
-    if len(axes := parts.get("axes", [])) == 9:
-        parts["turn"] = [*quaternion_of(axes)]
-    if (span := parts.get("span")) and all(map(math.isfinite, span)):
-        sides = [_side(span[axis::3]) for axis in range(3)]
-        parts |= {"size": sides} if any(sides) else {}
-    if "about" in parts:  # the y axis
-        half = parts["about"][0] / 2
-        parts["turn"] = [0.0, math.sin(half), 0.0, math.cos(half)]
-    if len(position := parts.get("position", [])) in (1, 2):  # a member is missing
-        position = [math.nan] * 3
-    size, turn = (_of_length(parts.get(name), n) for name, n in (("size", 3), ("turn", 4)))
-    yaw = [*map(math.radians, parts.get("degrees", ())), *parts.get("yaw", ()), None][0]
-    if len(position) != 3:
-        return None
-    if "up" not in form or not all(map(math.isfinite, position)):
-        return Solid(position, size, turn, yaw)
-    x, y, z = position
-    up = form["up"]
-    if up == "unity":  # a left-handed frame, whose z axis points the other way
-        up, z, yaw = "y", -z, None if yaw is None else -yaw
-    order, origin = form.get("order", "xyzw"), form.get("origin", "centre")
-    conventions = Conventions(up, box_origin=origin, quaternion_order=order)
-    try:
-        box = conventions.box((x, y, z), size, None if yaw is not None else turn, yaw)
-    except ValueError:  # no rotation
-        box = conventions.box((x, y, z), size)
-    return Solid(box[0] or position, box[1], None, box[2])
-
-
-def _of_length(values: list[float] | None, length: int) -> Any:
-    return tuple(values) if values and len(values) == length else None
-
-
 # --------------------------------------------------------------------------------------- scenes
 
 
@@ -371,7 +163,7 @@ def _scene_names(form: Form, records: list[Record]) -> list[str]:
     columns: list[list[str]] = []
     for name in () if _is_named(form) else FIELDS["scene"]:
         column = [str(value) if _is_plain(value := one.take(name)) else "" for one in records]
-        is_text = name == "frameid" and not all(map(_NUMBER.fullmatch, filter(None, column)))
+        is_text = name == "frameid" and not all(map(NUMBER.fullmatch, filter(None, column)))
         if len({*column}) > 1 and not is_text and (name not in FIELDS["time"] or not columns):
             columns.append(column)
     return [", ".join(names) for names in zip(*columns, strict=True)] or [""] * len(records)
@@ -379,7 +171,7 @@ def _scene_names(form: Form, records: list[Record]) -> list[str]:
 
 def _is_named(form: Form) -> bool:
     """Return whether a format names the fields of its boxes."""
-    return any(name in form for name in (*_IMAGE, *_SOLID))
+    return any(name in form for name in (*IMAGE, *SOLID))
 
 
 def _is_plain(value: Any) -> bool:
@@ -460,7 +252,7 @@ class _Reader:
             label = spot(record.chain, self.form["label"])
         else:
             found = [v for n in FIELDS["label"] if _is_plain(v := record.take(n))]
-            words = (one for one in found if isinstance(one, str) and not _NUMBER.fullmatch(one))
+            words = (one for one in found if isinstance(one, str) and not NUMBER.fullmatch(one))
             label = next(words, found[0] if found else None)
         return self.names.get(str(label), label)
 
@@ -488,7 +280,7 @@ class _Reader:
         if not _is_named(form):
             return self.found(record, what)
         values: dict[str, Any] = {
-            n: v for n in _SOLID if n in form and (v := spot(chain, form[n])) is not None
+            n: v for n in SOLID if n in form and (v := spot(chain, form[n])) is not None
         }
         if form.get("is_aligned") and "size" in values:
             values.pop("degrees", None)
@@ -498,7 +290,7 @@ class _Reader:
             box = self.set_box(others, what)
         if box is not None:
             return box, None
-        kinds = ((kind, spot(chain, form[kind])) for kind in _IMAGE if kind in form)
+        kinds = ((kind, spot(chain, form[kind])) for kind in IMAGE if kind in form)
         kind, value = next(((kind, v) for kind, v in kinds if v is not None), ("", None))
         if kind and "scale" in form and kind != "spans":
             scale = numerics(spot(chain, form["scale"]) or [1.0, 1.0], what)
@@ -551,7 +343,7 @@ class _Reader:
         if "frame" in self.form:
             return text(get(record.chain, self.form["frame"])).lstrip("/")
         frame = frame_of(take(record.node, "header")) or frame_of(record.node)
-        return "" if _NUMBER.fullmatch(frame) else frame
+        return "" if NUMBER.fullmatch(frame) else frame
 
     def stamp(self, record: Record) -> Any:
         if "stamp" in self.form or _is_named(self.form):
@@ -575,7 +367,7 @@ class _Reader:
         if "is_solid" in self.form:  # the layout of a ROS message is known
             return
         known = {*re.findall(r"\w+", json.dumps(self.form))}
-        names = dict.fromkeys(name for one in records[:_LOOKED_AT] for name in one.unread())
+        names = dict.fromkeys(name for one in records[:LOOKED_AT] for name in one.unread())
         if unread := [name for name in names if name not in known]:
             more = ", …" if len(unread) > _MOST_NAMES else ""
             named = ", ".join(unread[:_MOST_NAMES])[:200] + more
@@ -595,7 +387,7 @@ def _merged(records: list[Record], path: str) -> list[Record]:
 
 def as_stamp(value: Any) -> Any:
     """Convert seconds, ms, µs or ns since 1970 to a time of ROS; return other values unchanged."""
-    if isinstance(value, str) and _NUMBER.fullmatch(value):
+    if isinstance(value, str) and NUMBER.fullmatch(value):
         value = float(value)
     if (seconds := number(value)) is None:
         return None if isinstance(value, str) else value

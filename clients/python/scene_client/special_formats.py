@@ -11,8 +11,9 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
+from scene_client.boxes import numerics
 from scene_client.frames import Quaternion, Vector, product, rotated
-from scene_client.records import each, numerics
+from scene_client.paths import each
 from scene_client.ros_fields import items, members, numbers, take
 
 NO_TURN: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)

@@ -13,7 +13,8 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from scene_client.records import FORMATS, Form, Record, each, read, signs
+from scene_client.paths import each
+from scene_client.records import FORMATS, Form, Record, matches, read
 from scene_client.ros_fields import LabelMap, MessageError, read_label_map, take, unwrapped
 from scene_client.schemas import UnknownLabels
 from scene_client.sightings import SceneFields, Viewpoint, to_fields
@@ -103,7 +104,7 @@ def form_of(data: Any) -> Form | None:
     """Return the format of data or of a message, or None."""
     if take(data, "detections") in ([], ()):
         return _SOLID
-    return next((form for form in FORMATS if signs(form, data) == 1), None)
+    return next((form for form in FORMATS if matches(form, data)), None)
 
 
 def _converted(
