@@ -7,12 +7,12 @@ aliases.
 
 `head_of` returns the object in a phrase with "of": a "bottle of milk" is a bottle, and a "pair of
 shoes" is shoes. `readings` removes the syntax of detectors: a "mouse_(computer_equipment)" is a
-mouse, and "chair_12" is a chair.
+mouse, and "chair_12" is a chair. `names_nothing` finds labels without an object, such as "unknown".
 """
 
 import re
 import unicodedata
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from functools import lru_cache
 from itertools import islice
 from typing import Final, Literal, NamedTuple
@@ -43,6 +43,9 @@ LONGEST: Final = 256
 # The time of each pattern grows linearly with the length of a label: two repetitions that follow
 # each other never match the same character.
 _SEPARATORS: Final = re.compile(r"[\s_\-./'’‐-―]+")
+_INNER: Final = re.compile(r"(?<=[a-z])(?=[A-Z])|:")  # between the words of "cls:DeskLamp"
+# Unicode has no decomposition of these letters.
+_STROKES: Final = str.maketrans("łŁøØđĐħĦŧŦı", "lLoOdDhHtTi")
 
 # Words with these endings stay unchanged. Such words are not plurals, or their singular has another
 # meaning or does not exist. Compounds with these endings also stay unchanged ("rain pants").
@@ -130,12 +133,26 @@ def label_key(label: str) -> str:
     return label
 
 
-def split_words(label: str) -> tuple[str, ...]:
-    """Return the words of a label in lower case and singular; none of one longer than `LONGEST`."""
+def plain_words(label: str) -> list[str]:
+    """Return the words of a label in lower case; none of one longer than `LONGEST`."""
     folded = unicodedata.normalize("NFKC", label)
     if len(folded) > LONGEST:
-        return ()
-    return tuple(singular(word) for word in _SEPARATORS.split(folded.casefold()) if word)
+        return []
+    parts = _SEPARATORS.split(_INNER.sub(" ", folded).casefold())
+    return [word for word in parts if word]
+
+
+def split_words(label: str) -> tuple[str, ...]:
+    """Return the words of a label in lower case and singular; none of one longer than `LONGEST`."""
+    return tuple(map(singular, plain_words(label)))
+
+
+def without_accents(label: str) -> str:
+    """Return "lamp" for "łamp": a label without the accents and strokes of its letters."""
+    if label.isascii():
+        return label
+    decomposed = unicodedata.normalize("NFKD", label).translate(_STROKES)
+    return "".join(letter for letter in decomposed if not unicodedata.combining(letter))
 
 
 def _fold_unicode(label: str) -> str:
@@ -145,6 +162,42 @@ def _fold_unicode(label: str) -> str:
         return label
     composed = unicodedata.normalize("NFKC", composed.casefold())
     return singular(_SEPARATORS.sub("", composed))
+
+
+# ------------------------------------------------------------------------------------ no object
+
+# Words of annotators and tools for the lack of an object. A label of such words alone names none.
+_NOTHING: Final = frozenset(
+    (
+        *("unknown", "unk", "undefined", "undef", "unlabeled", "unlabelled", "unannotated"),
+        *("unidentified", "unclassified", "uncategorized", "unrecognized", "unnamed", "untitled"),
+        *("none", "null", "nil", "nan", "na", "notapplicable", "void", "invalid", "dontcare"),
+        *("ignore", "ignored", "remove", "removed", "delete", "deleted", "split", "merge"),
+        *("merged", "background", "groundplane", "placeholder", "todo", "tbd"),
+    )
+)
+_NEGATIONS: Final = frozenset(("no", "not", "non", "without", "never", "missing"))
+# Catalogue numbers: offsets of WordNet, mids of Freebase, uuids and other hexadecimal ids.
+_CATALOGUE: Final = re.compile(
+    r"[nvars]\d{8}|/[mg]/[\da-z_]{2,}|(?=[a-f\-]*\d)[\da-f][\da-f\-]{5,}", re.IGNORECASE
+)
+
+
+def names_nothing(label: str, more: Set[str] = frozenset()) -> bool:
+    """Return True for numbers, catalogue numbers and words such as "unknown", "REMOVE_2", "N/A".
+
+    ``more`` are further words for the lack of an object.
+    """
+    if not any(map(str.isalpha, label)) or _CATALOGUE.fullmatch(label.strip()) is not None:
+        return True
+    words = [word for word in split_words(label) if not word.isdigit()]
+    empty = _NOTHING | more
+    return "".join(words) in empty or (bool(words) and empty.issuperset(words))
+
+
+def names_an_object(label: str) -> bool:
+    """Return False for labels that name nothing, and for negations such as "no chair"."""
+    return not (names_nothing(label) or _NEGATIONS.issuperset(plain_words(label)[:1]))
 
 
 # ------------------------------------------------------------------------------------ syntax
@@ -161,24 +214,43 @@ _PROMPT: Final = re.compile(
     r"(?:(?:an?|the|some|one)[\s_])?",
     re.IGNORECASE,
 )
-# Prefixes of instances: folders ("objects/bed"), scopes ("kitchen::table_1::link") and numbers
-# ("011_banana"). Suffixes: senses of WordNet ("sofa.n.01"), coordinates ("Bed|-01.0|+00.0"),
-# numbers ("chair_12", "cup.001", "chair12"), versions ("couch_v2") and hexadecimal ids that
-# contain a digit ("Mug_b045e42b").
-_FOLDER: Final = re.compile(r"(?:objects?|models?|assets?|meshes)/", re.IGNORECASE)
-_LINKS: Final = frozenset({"", "link", "base_link", "body", "visual", "collision"})
-_SENSE: Final = re.compile(r"([^\W\d][\w\-]*)\.[nvars]\.\d\d(?!\d)")
-_NUMBER: Final = re.compile(r"\d+_")
-_COORDINATES: Final = re.compile(r"[^\W\d_]\|")
-# This pattern matches the reversed label. A search from the front would start at each letter.
-_IDS: Final = re.compile(
-    r"(?:(?:(?:%?(?=[a-f]*\d)[\da-f]+|\d+v)[\s_\-#.:]+)+|\d*)(?=[^\W\d_])", re.IGNORECASE
+_WORD: Final = re.compile(r"[^\W_]+")
+# These words describe an object also after its name: "dining_table_large".
+_DESCRIPTIONS: Final = frozenset(
+    "small medium large big tiny huge mini tall short long wide narrow left right open closed "  # noqa: SIM905
+    "empty full old new red orange yellow green blue purple violet pink brown black white grey "
+    "gray beige silver golden wooden metallic".split()
 )
+# Slashes separate the folders of a path, such as "/World/Table_1/Mug_2", if the label starts with
+# one, or if it has "::", CamelCase, the number of an instance or one of these folders. Otherwise
+# they separate alternatives.
+_STEP: Final = re.compile(r"[/\\]+|::")
+_PATH: Final = re.compile(r"\A[./\\~]|:[:/\\]|_\d+(?=[/\\]|\Z)|[a-z](?=[A-Z])")
+_FOLDERS: Final = frozenset(("object", "model", "asset", "mesh", "prop", "world", "scene"))
+_SPACED: Final = re.compile(r"\s[/\\]|[/\\]\s")
+_FILE: Final = re.compile(
+    r"\.(?:usd[acz]?|obj|dae|stl|glb|gltf|ply|fbx|off|urdf|sdf)\Z", re.IGNORECASE
+)
+# The last parts of a path often name parts of the object in a simulator.
+_LINKS: Final = frozenset(
+    ("link", "baselink", "body", "visual", "collision", "mesh", "geom", "geometry", "model")
+)
+_COORDINATES: Final = re.compile(r"[^\W\d_]\|")
+# Versions ("couch_v2"), counts ("cup x2"), numbers, and hexadecimal ids that contain a digit
+# ("Mug_b045e42b").
+_ID: Final = re.compile(r"[vx]\d+|(?=[a-f]*\d)[\da-f]+", re.IGNORECASE)
+_SENSES: Final = frozenset("nvars")  # of WordNet: "sofa.n.01"
 
 
 def readings(label: str) -> Iterator[tuple[Rule, str]]:
     """Yield pairs (rule, name) of the names in a detector's label, most certain name first."""
-    return islice(_readings(label), _MOST_READINGS)
+    if not names_an_object(label):
+        return
+    name = _end_of_path(label)
+    if name != label:
+        yield "instance", name
+    for rule, reading in islice(_readings(name), _MOST_READINGS):
+        yield rule if name == label else "instance", reading
 
 
 def _readings(label: str) -> Iterator[tuple[Rule, str]]:
@@ -201,6 +273,8 @@ def _by_one_rule(label: str) -> list[tuple[Rule, str]]:
         # The vocabulary can have a class for name and qualifier together.
         names = (f"{qualifier} {name}", f"{name} {qualifier}", name)
         pairs += [("qualifier", reading) for reading in names]
+    elif (name := _without_description(label)) != label:
+        pairs.append(("qualifier", name))
     pairs += [("alternative", part) for part in _alternatives(label)]
     prompt, article = _PROMPT.match(label), _ARTICLE.match(label)
     if prompt is None and article is not None:
@@ -214,7 +288,7 @@ def _by_one_rule(label: str) -> list[tuple[Rule, str]]:
 
 def _alternatives(label: str) -> list[str]:
     """Return the alternatives. In "coffee/side table", the alternatives share the last word."""
-    parts = [part for part in map(str.strip, _OR.split(_in_folder(label), _MOST_READINGS)) if part]
+    parts = [part for part in map(str.strip, _OR.split(label, _MOST_READINGS)) if part]
     if len(parts) < 2:
         return []
     last_words = parts[-1].split()
@@ -223,20 +297,39 @@ def _alternatives(label: str) -> list[str]:
     return parts
 
 
-def _in_folder(label: str) -> str:
-    """Return the label without a folder of all objects, such as "objects/"."""
-    return label if (folder := _FOLDER.match(label)) is None else label[folder.end() :]
+def _without_description(label: str) -> str:
+    """Return the label without sizes and colours after the name."""
+    words = list(_WORD.finditer(label))
+    end = len(words)
+    while end > 1 and words[end - 1][0].casefold() in _DESCRIPTIONS:
+        end -= 1
+    return label[: words[end - 1].end()] if end < len(words) else label
+
+
+def _end_of_path(label: str) -> str:
+    """Return the last part of a path that names an object, or a label that is no path."""
+    parts = [part for part in _STEP.split(label) if part] or [label]
+    is_path = _PATH.search(label) is not None or label_key(parts[0]) in _FOLDERS
+    if not is_path or parts == [label] or _SPACED.search(label) is not None:
+        parts = [label]
+    while len(parts) > 1 and label_key(parts[-1].rstrip("_0123456789")) in _LINKS:
+        parts.pop()
+    return _FILE.sub("", parts[-1])
 
 
 def without_instance(label: str) -> str:
-    """Return the label without the folder, scopes, sense, number, coordinates and ids."""
-    scopes = [part for part in _in_folder(label).split("::") if part.casefold() not in _LINKS]
-    whole = scopes[-1] if scopes else label
-    if (sense := _SENSE.match(whole)) is not None:
-        return sense[1]
-    number = _NUMBER.match(whole)
-    name = whole if number is None else whole[number.end() :]
+    """Return the label without path, numbers, sense, coordinates, ids and outer punctuation."""
+    name = _end_of_path(label)
     if (coordinates := _COORDINATES.search(name)) is not None:
-        return name[: coordinates.start() + 1]
-    ids = _IDS.match(name[::-1])
-    return whole if ids is None else name[: len(name) - ids.end()]
+        name = name[: coordinates.start() + 1]
+    words = list(_WORD.finditer(name))
+    first, end = 0, len(words)
+    while end > 1 and _ID.fullmatch(words[end - 1][0]):
+        end -= 1
+    if 1 < end < len(words) and words[end - 1][0] in _SENSES:
+        end -= 1
+    while first < end - 1 and words[first][0].isdecimal():
+        first += 1
+    if not words:
+        return label
+    return name[words[first].start() : words[end - 1].end()].rstrip("0123456789") or label

@@ -4,24 +4,26 @@
 worse than none. It reads a name in two ways:
 
     spelling   Misspelt words, such as "nigthstand". The edits lie within words, and their number
-               depends on the length of the word. Another entry with a similar spelling makes the
-               name ambiguous.
+               depends on the length of the word. English words are misspelt only in a known phrase:
+               "ceiling fun". Another entry at the same distance makes the name ambiguous,
+               unless it is much rarer.
     head       The last words of a phrase, such as "office table", without words after a preposition
-               ("table on wheels"). Modifiers alone decide nothing.
+               ("table on wheels"). Modifiers alone decide nothing. The last word needs its sense: a
+               "surfboard" is no board, and a "ground plane" no airplane.
 
-`NameIndex.nearest` returns plausible entries for error messages. The module does not use word
+`NameIndex.nearest` returns plausible entries for error messages. The module does not compare word
 vectors, because the nearest class by cosine similarity is right for only 40 % of held-out aliases.
 """
 
 import itertools
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
 from rapidfuzz import process
-from rapidfuzz.distance import OSA, Indel
+from rapidfuzz.distance import OSA
 
-from app.scene.labels import LookUp, head_of, split_words
+from app.scene.labels import LookUp, head_of, label_key, plain_words, singular, split_words
+from app.scene.words import word_vectors
 
 LONGEST: Final = 64
 """Maximum length of a name whose spelling the search compares, in characters.
@@ -34,16 +36,20 @@ _BY_REST: Final = 0.9  # factor if the first letters differ, because people rare
 _SAME_HEAD: Final = 0.5  # minimum similarity of names with the same last word
 _FARTHER: Final = 0.1  # maximum difference of similarity between a suggestion and the best one
 
-# Costs of edits: 1 for a letter too many or too few, 2 for another letter or two exchanged letters,
-# and 1 more for another first or last letter, which people rarely mistype.
+# The cost of a correction is the number of edits (OSA distance), and more for another first or last
+# letter, which people rarely mistype.
+_BY_FIRST: Final = 2
+_BY_LAST: Final = 1
 _BY_PHRASE: Final = 1  # additional cost if the other words of the phrase agree
-_MARGIN: Final = 1  # two entries with costs as close as this make a name ambiguous
-_MOST_EDITS: Final = 2
-_MOST_CORRECTIONS: Final = 6
+_BY_ENGLISH: Final = 2  # cost of one edit of an English word in a phrase
+_RARER: Final = 16  # of two similar entries, the rarer one is so many times as far from the first
+_MOST_CORRECTIONS: Final = 8
 _MOST_WORDS: Final = 8
 _MOST_MISSPELT: Final = 2  # number of words of a phrase
+_MOST_ENGLISH: Final = 4  # number of words of a phrase with an English word in the wrong place
 _SHORTEST: Final = 4  # number of letters; a shorter word with a mistake can be anything
 _BY_HEAD: Final = 0.9  # factor if modifiers are unknown
+_SAME_SENSE: Final = 0.5  # share of the names with a last word that are kinds of one entry
 
 _PREPOSITIONS: Final = frozenset(
     ("of", "with", "on", "in", "for", "behind", "under", "below", "above", "over", "near", "beside")
@@ -53,15 +59,13 @@ _SEVERAL: Final = frozenset(("and", "or", "&", "+", "without"))
 _TOGETHER: Final = frozenset(("with", "in"))
 # A "toy trailer" is a toy, and a "puppet cat" is a puppet.
 _IMITATIONS: Final = frozenset(("toy", "stuffed", "plush", "puppet"))
-# A modifier changes the meaning of these words: "cell" means a phone, but "jail cell" means a room.
+# A part of a thing shows the thing.
+_PARTS: Final = frozenset(("part", "piece", "section"))
+# A modifier changes the meaning of these words: a "baseball cap" is a hat, but not a "bottle cap".
 _AMBIGUOUS: Final = frozenset(
-    "bar board boat burner button can cap card cell chip cleaner conditioner console controller "  # noqa: SIM905
-    "cooker cover cream cube cycle die disc dish disk draw dressing dryer equipment file "
-    "filing foundation frame glass ground hall handle hanger holder hood horse iron island jam "
-    "jelly keyboard letter mail maker marble mint mold monitor nail nut oil pack pad part paste "
-    "pepper phone plate player plug pole polish present rail receiver register ring roll salt "
-    "scooter screen self shade sheet shower slab spray stand stick stopper string switch "
-    "tablet tank tape throw tie top tower trunk tub tube vest washer washing weight".split()
+    "board boat cap card chip cooker die dish disk dressing foundation frame glass ground handle "  # noqa: SIM905
+    "hanger jam mail marble mint monitor nail nut pad plug polish present self shower stand string "
+    "throw trunk tube washer weight".split()
 )
 
 
@@ -73,12 +77,18 @@ class Match(NamedTuple):
 
 
 class NameIndex:
-    """Search for entries by similar names, from pairs (name, index). An entry may have several."""
+    """Search for entries by similar names.
 
-    def __init__(self, names: Sequence[tuple[str, int]]) -> None:
+    The names are pairs (name, index), the commonest entry first. An entry may have several names,
+    its label first. ``parents`` has the index of the broader entry of each entry, or -1.
+    """
+
+    def __init__(self, names: Sequence[tuple[str, int]], parents: Sequence[int] = ()) -> None:
         """Split the names into words. Index them by key (joined words), last word and length."""
-        self._entries = [index for _, index in names]
+        self._entries, self._parents = [index for _, index in names], parents
+        self._labels = {index: label_key(name) for name, index in reversed(names)}
         self._words = [split_words(name) for name, _ in names]
+        self._phrases = frozenset(self._words)
         self._keys = ["".join(words) for words in self._words]
         self._by_key = dict(zip(self._keys, self._entries, strict=True))
         self._by_head: dict[str, list[int]] = {}
@@ -91,21 +101,20 @@ class NameIndex:
 
     def guess(self, name: str) -> LookUp | None:
         """Return the entry whose name or last words a name probably stands for, or None."""
-        words = split_words(head_of(name) or name)
+        typed = plain_words(head_of(name) or name)
+        words = tuple(map(singular, typed))
         if len("".join(words)) > LONGEST or len(words) > _MOST_WORDS or _SEVERAL & {*words}:
             return None
-        unknown = {*words} - self._entry_words
-        corrections = {word: [(word, 0)] for word in words}
-        if len(unknown) <= _MOST_MISSPELT:
-            corrections |= {word: self._corrections(word) for word in unknown}
-        if (guess := self._by_corrections(words, corrections)) is not None:
+        if (guess := self._by_corrections(typed)) is not None:
             return guess
         prepositions = [k for k, word in enumerate(words) if k and word in _PREPOSITIONS]
         end = prepositions[0] if prepositions else len(words)
         # "vase with flowers" names two objects.
         names_two = bool(_TOGETHER & {*words[end : end + 1]})
-        if names_two and self._by_corrections(words[end + 1 :], corrections) is not None:
+        if names_two and self._by_corrections(typed[end + 1 :]) is not None:
             return None
+        while end > 1 and words[end - 1] in _PARTS:
+            end -= 1
         return self._by_head_words(words[:end])
 
     def _by_head_words(self, words: Sequence[str]) -> LookUp | None:
@@ -113,50 +122,94 @@ class NameIndex:
         imitations = [word for word in words[:-1] if word in _IMITATIONS]
         for start in range(len(words)):
             head = imitations[:1] or words[start:]
-            if start and len(head) == 1 and head[0] in _AMBIGUOUS:
-                return None
             if (entry := self._by_key.get("".join(head))) is not None:
-                return LookUp(entry, _BY_HEAD, "head")
+                keeps_sense = not start or self._keeps_sense(words[start - 1], head, entry)
+                return LookUp(entry, _BY_HEAD, "head") if keeps_sense else None
         return None
 
-    def _by_corrections(
-        self, words: Sequence[str], corrections: Mapping[str, Sequence[tuple[str, int]]]
-    ) -> LookUp | None:
-        """Return the one entry that the phrase names with few enough misspellings, or None."""
-        costs: dict[int, tuple[int, int]] = {}  # by entry: cost and maximum cost
-        for spelling in itertools.product(*(corrections[word] for word in words)):
-            entry = self._by_key.get("".join(word for word, _ in spelling))
-            if entry is None:
-                continue
-            cost = sum(cost for _, cost in spelling)
-            max_cost = sum(_max_cost(word) for word, cost in spelling if cost)
-            if max_cost and len(words) > 1:
-                max_cost += _BY_PHRASE
-            costs[entry] = min((cost, max_cost), costs.get(entry, (cost, max_cost)))
-        if not costs:
-            return None
-        (entry, (cost, max_cost)), *others = sorted(costs.items(), key=lambda item: item[1])
-        second_cost = min((other_cost for _, (other_cost, _) in others), default=math.inf)
-        if cost > max_cost or second_cost - cost <= _MARGIN:
-            return None
-        return LookUp(entry, round(1 - cost / 2 / len("".join(words)), 3), "spelling")
+    def _keeps_sense(self, modifier: str, head: Sequence[str], entry: int) -> bool:
+        """Return whether the last words of a phrase still name an entry after a modifier."""
+        # A "lamp desk" is perhaps a desk lamp.
+        if self._by_key.get("".join((*head, modifier)), entry) != entry:
+            return False
+        if len(head) > 1:
+            return True
+        # The label completes a short name, so another modifier makes another thing: the "remote" of
+        # "remote control".
+        word, label = head[0], self._labels[entry]
+        if word in _AMBIGUOUS or (word in label and word != label):
+            return False
+        # Most of the known names with this last word must be names of the entry or its kinds.
+        others = [row for row in self._by_head.get(word, ()) if len(self._words[row]) > 1]
+        kinds = sum(self._is_kind(self._entries[row], entry) for row in others)
+        return kinds + 1 >= _SAME_SENSE * len(others)
 
-    def _corrections(self, word: str) -> list[tuple[str, int]]:
-        """Return at most `_MOST_CORRECTIONS` pairs (word of the lexicon, cost), cheapest first."""
-        if len(word) < _SHORTEST:
-            return [(word, 0)]
-        lengths = range(max(_SHORTEST, len(word) - _MOST_EDITS), len(word) + _MOST_EDITS + 1)
-        candidates = [other for length in lengths for other in self._lexicon.get(length, ())]
-        most = _MOST_EDITS + _BY_PHRASE
-        matches = process.extract(
-            word, candidates, scorer=Indel.distance, limit=None, score_cutoff=most
-        )
-        corrections = [
-            (other, cost + (other[0] != word[0]) + (other[-1] != word[-1]))
-            for other, cost, _ in matches
+    def _is_kind(self, kind: int, entry: int) -> bool:
+        while kind not in (entry, -1):
+            kind = self._parents[kind] if self._parents else -1
+        return kind == entry
+
+    def _by_corrections(self, typed: Sequence[str]) -> LookUp | None:
+        """Return the one entry that the phrase names with few enough misspellings, or None."""
+        costs: dict[int, int] = {}
+        for spelling, cost in self._spellings(typed):
+            entry = self._by_key.get("".join(spelling))
+            if entry is not None:
+                costs[entry] = min(cost, costs.get(entry, cost))
+        cheapest = min(costs.values(), default=0)
+        entries = sorted(entry for entry, cost in costs.items() if cost == cheapest)
+        if not entries or (len(entries) > 1 and entries[1] < _RARER * (entries[0] + 1)):
+            return None
+        return LookUp(entries[0], round(1 - cheapest / len("".join(typed)), 3), "spelling")
+
+    def _spellings(self, typed: Sequence[str]) -> Iterator[tuple[list[str], int]]:
+        """Yield the spellings of a phrase that need few enough edits, and their costs."""
+        words = [singular(word) for word in typed]
+        yield words, 0
+        misspelt = [
+            word not in self._entry_words and not any(map(word_vectors().knows, (word, plural)))
+            for word, plural in zip(words, typed, strict=True)
         ]
-        cheapest = sorted(corrections, key=lambda correction: correction[1])[:_MOST_CORRECTIONS]
-        return cheapest or [(word, 0)]
+        if sum(misspelt) > _MOST_MISSPELT:
+            return
+        if any(misspelt):
+            corrections = [
+                self._corrections({word, plural}, len(words) > 1) if is_misspelt else [(word, 0)]
+                for word, plural, is_misspelt in zip(words, typed, misspelt, strict=True)
+            ]
+            for spelling in itertools.product(*corrections):
+                yield [word for word, _ in spelling], sum(cost for _, cost in spelling)
+        elif 1 < len(words) <= _MOST_ENGLISH:
+            for k, word in enumerate(words):
+                for other in self._alike({word}, 1):
+                    spelling = (*words[:k], other, *words[k + 1 :])
+                    if other[0] == word[0] and spelling in self._phrases:
+                        yield spelling, _BY_ENGLISH
+
+    def _corrections(self, forms: set[str], is_in_phrase: bool) -> list[tuple[str, int]]:
+        """Return at most `_MOST_CORRECTIONS` pairs (word of the lexicon, cost), cheapest first.
+
+        The forms are a misspelt word and its singular.
+        """
+        most = _most_edits(min(map(len, forms))) + _BY_PHRASE * is_in_phrase
+        costs = {
+            other: min(_cost(form, other) for form in forms) for other in self._alike(forms, most)
+        }
+        allowed = sorted((cost, other) for other, cost in costs.items() if cost <= most)
+        return [(other, cost) for cost, other in allowed[:_MOST_CORRECTIONS]]
+
+    def _alike(self, forms: set[str], most_edits: int) -> set[str]:
+        """Return the words of the lexicon within a few edits of forms of a word."""
+        found: set[str] = set()
+        for form in forms:
+            if len(form) >= _SHORTEST:
+                lengths = range(len(form) - most_edits, len(form) + most_edits + 1)
+                words = [word for length in lengths for word in self._lexicon.get(length, ())]
+                matches = process.extract(
+                    form, words, scorer=OSA.distance, limit=None, score_cutoff=most_edits
+                )
+                found.update(word for word, _, _ in matches)
+        return found
 
     def nearest(self, name: str, limit: int) -> tuple[Match, ...]:
         """Return at most ``limit`` plausible entries, most similar first.
@@ -178,7 +231,7 @@ class NameIndex:
         """Yield the entries whose names have a spelling similar to ``key``, a name in one word."""
         if len(key) > LONGEST:
             return
-        for similar_key, similarity, row in _alike(key, self._keys):
+        for similar_key, similarity, row in _similar(key, self._keys):
             factor = 1 if similar_key[:1] == key[:1] else _BY_REST
             yield Match(self._entries[row], similarity * factor)
 
@@ -192,11 +245,11 @@ class NameIndex:
 
 def spelt_alike(name: str, names: Sequence[str]) -> list[str]:
     """Return up to three names of similar spelling, most similar first, without reading words."""
-    matches = _alike(name[:LONGEST], [other[:LONGEST] for other in names], 3)
+    matches = _similar(name[:LONGEST], [other[:LONGEST] for other in names], 3)
     return [names[row] for _, _, row in matches]
 
 
-def _alike(
+def _similar(
     name: str, names: Sequence[str], limit: int | None = None
 ) -> list[tuple[str, float, int]]:
     """Return triples (similar name, similarity, index of the name), most similar first."""
@@ -204,6 +257,10 @@ def _alike(
     return process.extract(name, names, scorer=similarity, limit=limit, score_cutoff=_LEAST)
 
 
-def _max_cost(word: str) -> int:
-    """Return the maximum cost of the edits that lead to a word of the lexicon."""
-    return 1 if len(word) < 5 else _MOST_EDITS
+def _cost(typed: str, word: str) -> int:
+    ends = _BY_FIRST * (typed[0] != word[0]) + _BY_LAST * (typed[-1] != word[-1])
+    return OSA.distance(typed, word) + ends
+
+
+def _most_edits(letters: int) -> int:
+    return 1 if letters < 6 else 2 if letters < 9 else 3

@@ -10,7 +10,17 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike, NDArray
 
-from app.scene.labels import LookUp, Rule, head_of, label_key, readings, split_words
+from app.scene.labels import (
+    LookUp,
+    Rule,
+    head_of,
+    label_key,
+    names_an_object,
+    readings,
+    split_words,
+    without_accents,
+    without_instance,
+)
 from app.scene.nearest import Match, NameIndex
 from app.scene.scene import SceneObject
 from app.scene.words import Vectors, class_vectors, word_vectors
@@ -222,12 +232,17 @@ class Vocabulary:
     def read(self, label: str, *, is_room: bool = False) -> LookUp | None:
         """Return the class or room type that a label or one of its `readings` names, or None."""
         index_of = self.room_index if is_room else self.index
-        if (index := index_of(label)) is not None:
-            return LookUp(index, 1.0, self._rule_of(label, index, is_room=is_room))
-        for rule, name in readings(label):
-            if (index := index_of(name)) is not None:
-                return LookUp(index, 1.0, rule)
-        return None
+        for text in dict.fromkeys((label, without_accents(label))):
+            if (index := index_of(text)) is not None:
+                return LookUp(index, 1.0, self._rule_of(text, index, is_room=is_room))
+            for rule, name in readings(text):
+                if (index := index_of(name)) is not None:
+                    return LookUp(index, 1.0, rule)
+        *words, last = split_words(without_instance(label)) or ("",)
+        # "trash bin can": a trash bin, and a trash can.
+        first, second = (index_of("".join(name)) for name in (words, (*words[:-1], last)))
+        is_one = bool(words) and first is not None and first == second
+        return LookUp(first, 1.0, "alternative") if is_one else None
 
     def _rule_of(self, label: str, index: int, *, is_room: bool) -> Rule:
         """Return why `index` or `room_index` gives this index for a label."""
@@ -242,7 +257,7 @@ class Vocabulary:
 
     @cached_property
     def _names(self) -> NameIndex:
-        return NameIndex(list(self._by_spelling.items()))
+        return NameIndex(list(self._by_spelling.items()), self.parents.tolist())
 
     @cached_property
     def _room_names(self) -> NameIndex:
@@ -259,6 +274,10 @@ class Vocabulary:
     @_remembered
     def guess(self, label: str, *, is_room: bool = False) -> LookUp | None:
         """Return the class or room type that an unknown label probably stands for, or None."""
+        if not is_room and self.room_index(label) is not None:
+            return None  # the "hall" of "dining hall" is a corridor
+        if not is_room and self.room_index(label) is not None:
+            return None  # the "hall" of "dining hall" is a corridor
         names = self._room_names if is_room else self._names
         guesses = (names.guess(name) for name in _names_to_guess(label))
         return next((guess for guess in guesses if guess is not None), None)
@@ -357,10 +376,14 @@ _SHARED: Final = (
 
 
 def _names_to_guess(label: str) -> list[str]:
-    """Return the alternatives of an unknown label, else its last reading, else the label."""
+    """Return alternatives of an unknown label and the label, or its last reading, or the label."""
+    if not names_an_object(label):
+        return []
     pairs = list(readings(label))
     alternatives = [name for rule, name in pairs if rule == "alternative"]
-    return alternatives[:_MOST_GUESSED] or [name for _, name in pairs][-1:] or [label]
+    if alternatives:
+        return [*alternatives, label][:_MOST_GUESSED]
+    return [name for _, name in pairs][-1:] or [label]
 
 
 def do_not_fit(

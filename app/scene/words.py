@@ -52,6 +52,10 @@ class WordVectors:
             return None
         return _mean([_unit(self.vectors[row] * np.float32(self.scale)) for row in rows])
 
+    def knows(self, word: str) -> bool:
+        """Return whether a word in lower case has a vector."""
+        return word in self._rows
+
     def _row(self, word: str) -> int | None:
         forms = (word, word.removesuffix("s"), word.removesuffix("es"))
         return next((self._rows[form] for form in forms if form in self._rows), None)

@@ -158,11 +158,14 @@ def test_the_cost_of_a_hostile_label(is_room: bool) -> None:
 
 def test_a_hostile_label_has_few_guesses(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[str] = []
+    seen = 0
     monkeypatch.setattr(NameIndex, "guess", lambda _, name: calls.append(name))
     for label in WORST:
         fresh().guess(label[:MAX_LABEL])
-        assert 1 <= len(calls) <= 3
+        assert len(calls) <= 3
+        seen += len(calls)
         calls.clear()
+    assert seen
 
 
 @pytest.mark.parametrize("treatment", ["error", "ignore", "nearest", "nearest-or-ignore"])

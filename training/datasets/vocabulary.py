@@ -8,14 +8,13 @@ failed, so scenes and inventories are read without it. A sense of WordNet names 
 from __future__ import annotations
 
 import json
-import re
 import tomllib
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, lru_cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -23,7 +22,7 @@ from pydantic import ValidationError
 from app.model.fields import first_error
 from app.registry import VocabularyEntry
 from app.scene import ObjectClass, Vocabulary, head_of, label_key
-from app.scene.labels import split_words, without_instance
+from app.scene.labels import names_nothing, without_instance
 from training.datasets.records import AnnotatedScene
 
 NAMES_FILE = Path(__file__).resolve().parent / "vocabularies" / "names.toml"
@@ -272,23 +271,13 @@ def coverage(vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene]) -> float:
     return sum(covered) / mentions.total()
 
 
-# Catalogue numbers: offsets of WordNet, mids of Freebase, uuids and other hexadecimal ids.
-_CATALOGUE: Final = re.compile(
-    r"[nvars]\d{8}|/[mg]/[\da-z_]{2,}|(?=[a-f\-]*\d)[\da-f][\da-f\-]{5,}", re.IGNORECASE
-)
-
-
 @lru_cache(maxsize=4096)
 def is_placeholder(label: str) -> bool:
     """Return True if a label names no kind of object."""
-    text = label.strip()
-    if not any(map(str.isalpha, text)) or _CATALOGUE.fullmatch(text) is not None:
-        return True
-    name, names = without_instance(text), curated_names()
-    empty = {*names.placeholders, *(() if name == text else names.numbered)}
-    words = [word for word in split_words(name) if not word.isdigit()]
-    joined = label_key("".join(words))
-    return joined in names.placeholders or (bool(words) and empty.issuperset(words))
+    name, names = without_instance(label), curated_names()
+    numbered = () if name == label.strip() else names.numbered
+    empty = frozenset((*names.placeholders, *numbered))
+    return names_nothing(label, empty) or names_nothing(name, empty)
 
 
 def plain_label(label: str) -> str:
