@@ -217,9 +217,9 @@ _PROMPT: Final = re.compile(
 _WORD: Final = re.compile(r"[^\W_]+")
 # These words describe an object also after its name: "dining_table_large".
 _DESCRIPTIONS: Final = frozenset(
-    "small medium large big tiny huge mini tall short long wide narrow left right open closed "  # noqa: SIM905
-    "empty full old new red orange yellow green blue purple violet pink brown black white grey "
-    "gray beige silver golden wooden metallic".split()
+    "small medium large big tiny huge mini tall short long wide narrow upper lower left right "  # noqa: SIM905
+    "open closed empty full old new red orange yellow green blue purple violet pink brown "
+    "black white grey gray beige silver golden wooden metallic".split()
 )
 # Slashes separate the folders of a path, such as "/World/Table_1/Mug_2", if the label starts with
 # one, or if it has "::", CamelCase, the number of an instance or one of these folders. Otherwise

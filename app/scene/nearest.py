@@ -40,8 +40,6 @@ _FARTHER: Final = 0.1  # maximum difference of similarity between a suggestion a
 # letter, which people rarely mistype.
 _BY_FIRST: Final = 2
 _BY_LAST: Final = 1
-_BY_PHRASE: Final = 1  # additional cost if the other words of the phrase agree
-_BY_ENGLISH: Final = 2  # cost of one edit of an English word in a phrase
 _RARER: Final = 16  # of two similar entries, the rarer one is so many times as far from the first
 _MOST_CORRECTIONS: Final = 8
 _MOST_WORDS: Final = 8
@@ -57,15 +55,16 @@ _PREPOSITIONS: Final = frozenset(
 # These words join two objects: "stove and oven", and "vase with flowers" if both are known.
 _SEVERAL: Final = frozenset(("and", "or", "&", "+", "without"))
 _TOGETHER: Final = frozenset(("with", "in"))
+# A part of a thing shows the thing: "piano lower part".
+_PARTS: Final = frozenset(("part", "lower", "upper"))
 # A "toy trailer" is a toy, and a "puppet cat" is a puppet.
 _IMITATIONS: Final = frozenset(("toy", "stuffed", "plush", "puppet"))
-# A part of a thing shows the thing.
-_PARTS: Final = frozenset(("part", "piece", "section"))
 # A modifier changes the meaning of these words: a "baseball cap" is a hat, but not a "bottle cap".
 _AMBIGUOUS: Final = frozenset(
-    "board boat cap card chip cooker die dish disk dressing foundation frame glass ground handle "  # noqa: SIM905
-    "hanger jam mail marble mint monitor nail nut pad plug polish present self shower stand string "
-    "throw trunk tube washer weight".split()
+    "alcohol board boat cap card chip cone cooker cracker cradle die dish disk dressing earth "  # noqa: SIM905
+    "flute foundation frame glass ground handle hanger heel jam letter log mail marble match mate "
+    "mint mobile monitor nail nut pad peg plug polish powder present range recorder self server "
+    "shower spot squash stand string syrup throw trunk tube washer weight wool".split()
 )
 
 
@@ -181,20 +180,23 @@ class NameIndex:
                 yield [word for word, _ in spelling], sum(cost for _, cost in spelling)
         elif 1 < len(words) <= _MOST_ENGLISH:
             for k, word in enumerate(words):
-                for other in self._alike({word}, 1):
+                for other in self._alike({word}, 1) if word not in self._entry_words else ():
                     spelling = (*words[:k], other, *words[k + 1 :])
                     if other[0] == word[0] and spelling in self._phrases:
-                        yield spelling, _BY_ENGLISH
+                        yield spelling, 1
 
     def _corrections(self, forms: set[str], is_in_phrase: bool) -> list[tuple[str, int]]:
         """Return at most `_MOST_CORRECTIONS` pairs (word of the lexicon, cost), cheapest first.
 
         The forms are a misspelt word and its singular.
         """
-        most = _most_edits(min(map(len, forms))) + _BY_PHRASE * is_in_phrase
+        letters = min(map(len, forms))
+        edits = max(1, 3 * letters // 8)
         costs = {
-            other: min(_cost(form, other) for form in forms) for other in self._alike(forms, most)
+            other: min(_cost(form, other) for form in forms) for other in self._alike(forms, edits)
         }
+        # The other words of a phrase confirm a correction.
+        most = 1 + (letters > 5) + (letters > 9) + is_in_phrase
         allowed = sorted((cost, other) for other, cost in costs.items() if cost <= most)
         return [(other, cost) for cost, other in allowed[:_MOST_CORRECTIONS]]
 
@@ -260,7 +262,3 @@ def _similar(
 def _cost(typed: str, word: str) -> int:
     ends = _BY_FIRST * (typed[0] != word[0]) + _BY_LAST * (typed[-1] != word[-1])
     return OSA.distance(typed, word) + ends
-
-
-def _most_edits(letters: int) -> int:
-    return 1 if letters < 6 else 2 if letters < 9 else 3
