@@ -5,7 +5,7 @@ worse than none. It reads a name in two ways:
 
     spelling   Misspelt words, such as "nigthstand". The edits lie within words, and their number
                depends on the length of the word. English words are misspelt only in a known phrase:
-               "ceiling fun". Another entry at the same distance makes the name ambiguous,
+               "ceiling fun". Another entry at a similar distance makes the name ambiguous,
                unless it is much rarer.
     head       The last words of a phrase, such as "office table", without words after a preposition
                ("table on wheels"). Modifiers alone decide nothing. The last word needs its sense: a
@@ -40,6 +40,9 @@ _FARTHER: Final = 0.1  # maximum difference of similarity between a suggestion a
 # letter, which people rarely mistype.
 _BY_FIRST: Final = 2
 _BY_LAST: Final = 1
+_MOST_JOINED: Final = 1  # cost of a correction to several words of a name in one: "trascan"
+_MARGIN: Final = 1  # two entries with costs as close as this make a long name ambiguous
+_LONG: Final = 8  # letters
 _RARER: Final = 16  # of two similar entries, the rarer one is so many times as far from the first
 _MOST_CORRECTIONS: Final = 8
 _MOST_WORDS: Final = 8
@@ -62,9 +65,10 @@ _IMITATIONS: Final = frozenset(("toy", "stuffed", "plush", "puppet"))
 # A modifier changes the meaning of these words: a "baseball cap" is a hat, but not a "bottle cap".
 _AMBIGUOUS: Final = frozenset(
     "alcohol board boat cap card chip cone cooker cracker cradle die dish disk dressing earth "  # noqa: SIM905
-    "flute foundation frame glass ground handle hanger heel jam letter log mail marble match mate "
-    "mint mobile monitor nail nut pad peg plug polish powder present range recorder self server "
-    "shower spot squash stand string syrup throw trunk tube washer weight wool".split()
+    "flute foundation frame glass ground handle hanger heel jam letter log mail marble match "
+    "mate mint mobile monitor nail nut pad peg plug polish powder present range recorder "
+    "robot rose self server shower spot squash stand string syrup throw trunk tube washer "
+    "weight wool".split()
 )
 
 
@@ -155,11 +159,17 @@ class NameIndex:
             entry = self._by_key.get("".join(spelling))
             if entry is not None:
                 costs[entry] = min(cost, costs.get(entry, cost))
-        cheapest = min(costs.values(), default=0)
-        entries = sorted(entry for entry, cost in costs.items() if cost == cheapest)
-        if not entries or (len(entries) > 1 and entries[1] < _RARER * (entries[0] + 1)):
+        if not costs:
             return None
-        return LookUp(entries[0], round(1 - cheapest / len("".join(typed)), 3), "spelling")
+        letters = len("".join(typed))
+        entry, cost = min(costs.items(), key=lambda item: item[::-1])
+        margin = _MARGIN if cost and letters >= _LONG else 0
+        others = [
+            other for other, more in costs.items() if other != entry and more <= cost + margin
+        ]
+        if any(other < _RARER * (entry + 1) for other in others):
+            return None
+        return LookUp(entry, round(1 - cost / letters, 3), "spelling")
 
     def _spellings(self, typed: Sequence[str]) -> Iterator[tuple[list[str], int]]:
         """Yield the spellings of a phrase that need few enough edits, and their costs."""
@@ -197,7 +207,11 @@ class NameIndex:
         }
         # The other words of a phrase confirm a correction.
         most = 1 + (letters > 5) + (letters > 9) + is_in_phrase
-        allowed = sorted((cost, other) for other, cost in costs.items() if cost <= most)
+        allowed = sorted(
+            (cost, other)
+            for other, cost in costs.items()
+            if cost <= (most if other in self._entry_words else _MOST_JOINED)
+        )
         return [(other, cost) for cost, other in allowed[:_MOST_CORRECTIONS]]
 
     def _alike(self, forms: set[str], most_edits: int) -> set[str]:
