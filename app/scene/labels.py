@@ -149,8 +149,6 @@ def split_words(label: str) -> tuple[str, ...]:
 
 def without_accents(label: str) -> str:
     """Return "lamp" for "łamp": a label without the accents and strokes of its letters."""
-    if label.isascii():
-        return label
     decomposed = unicodedata.normalize("NFKD", label).translate(_STROKES)
     return "".join(letter for letter in decomposed if not unicodedata.combining(letter))
 
@@ -176,7 +174,7 @@ _NOTHING: Final = frozenset(
         *("merged", "background", "groundplane", "placeholder", "todo", "tbd"),
     )
 )
-_NEGATIONS: Final = frozenset(("no", "not", "non", "without", "never", "missing"))
+NEGATIONS: Final = frozenset(("no", "not", "non", "without", "never", "missing"))
 # Catalogue numbers: offsets of WordNet, mids of Freebase, uuids and other hexadecimal ids.
 _CATALOGUE: Final = re.compile(
     r"[nvars]\d{8}|/[mg]/[\da-z_]{2,}|(?=[a-f\-]*\d)[\da-f][\da-f\-]{5,}", re.IGNORECASE
@@ -197,7 +195,8 @@ def names_nothing(label: str, more: Set[str] = frozenset()) -> bool:
 
 def names_an_object(label: str) -> bool:
     """Return False for labels that name nothing, and for negations such as "no chair"."""
-    return not (names_nothing(label) or _NEGATIONS.issuperset(plain_words(label)[:1]))
+    words = plain_words(_end_of_path(label))
+    return not (NEGATIONS.issuperset(words[:1]) or names_nothing(label))
 
 
 # ------------------------------------------------------------------------------------ syntax

@@ -22,7 +22,15 @@ from typing import Final, NamedTuple
 from rapidfuzz import process
 from rapidfuzz.distance import OSA
 
-from app.scene.labels import LookUp, head_of, label_key, plain_words, singular, split_words
+from app.scene.labels import (
+    NEGATIONS,
+    LookUp,
+    head_of,
+    label_key,
+    plain_words,
+    singular,
+    split_words,
+)
 from app.scene.words import word_vectors
 
 LONGEST: Final = 64
@@ -56,7 +64,7 @@ _PREPOSITIONS: Final = frozenset(
     ("of", "with", "on", "in", "for", "behind", "under", "below", "above", "over", "near", "beside")
 )
 # These words join two objects: "stove and oven", and "vase with flowers" if both are known.
-_SEVERAL: Final = frozenset(("and", "or", "&", "+", "without"))
+_SEVERAL: Final = frozenset(("and", "or", "&", "+", *NEGATIONS))
 _TOGETHER: Final = frozenset(("with", "in"))
 # A part of a thing shows the thing: "piano lower part".
 _PARTS: Final = frozenset(("part", "lower", "upper"))
@@ -191,9 +199,9 @@ class NameIndex:
         elif 1 < len(words) <= _MOST_ENGLISH:
             for k, word in enumerate(words):
                 for other in self._alike({word}, 1) if word not in self._entry_words else ():
-                    spelling = (*words[:k], other, *words[k + 1 :])
-                    if other[0] == word[0] and spelling in self._phrases:
-                        yield spelling, 1
+                    phrase = [*words[:k], other, *words[k + 1 :]]
+                    if other[0] == word[0] and tuple(phrase) in self._phrases:
+                        yield phrase, 1
 
     def _corrections(self, forms: set[str], is_in_phrase: bool) -> list[tuple[str, int]]:
         """Return at most `_MOST_CORRECTIONS` pairs (word of the lexicon, cost), cheapest first.

@@ -232,17 +232,18 @@ class Vocabulary:
     def read(self, label: str, *, is_room: bool = False) -> LookUp | None:
         """Return the class or room type that a label or one of its `readings` names, or None."""
         index_of = self.room_index if is_room else self.index
-        for text in dict.fromkeys((label, without_accents(label))):
-            if (index := index_of(text)) is not None:
-                return LookUp(index, 1.0, self._rule_of(text, index, is_room=is_room))
-            for rule, name in readings(text):
-                if (index := index_of(name)) is not None:
-                    return LookUp(index, 1.0, rule)
-        *words, last = split_words(without_instance(label)) or ("",)
+        if (index := index_of(label)) is not None:
+            return LookUp(index, 1.0, self._rule_of(label, index, is_room=is_room))
+        for rule, name in readings(label):
+            if (index := index_of(name)) is not None:
+                return LookUp(index, 1.0, rule)
+        words = split_words(without_instance(label))
         # "trash bin can": a trash bin, and a trash can.
-        first, second = (index_of("".join(name)) for name in (words, (*words[:-1], last)))
-        is_one = bool(words) and first is not None and first == second
-        return LookUp(first, 1.0, "alternative") if is_one else None
+        index = index_of("".join(words[:-1]))
+        if index is not None and index == index_of("".join((*words[:-2], words[-1]))):
+            return LookUp(index, 1.0, "alternative")
+        plain = without_accents(label)
+        return None if plain == label else self.read(plain, is_room=is_room)
 
     def _rule_of(self, label: str, index: int, *, is_room: bool) -> Rule:
         """Return why `index` or `room_index` gives this index for a label."""
