@@ -195,8 +195,9 @@ def names_nothing(label: str, more: Set[str] = frozenset()) -> bool:
 
 def names_an_object(label: str) -> bool:
     """Return False for labels that name nothing, and for negations such as "no chair"."""
-    words = plain_words(_end_of_path(label))
-    return not (NEGATIONS.issuperset(words[:1]) or names_nothing(label))
+    name = _end_of_path(label)
+    is_negated = NEGATIONS.issuperset(plain_words(name)[:1])
+    return not (is_negated or names_nothing(label) or (name != label and names_nothing(name)))
 
 
 # ------------------------------------------------------------------------------------ syntax

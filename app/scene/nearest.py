@@ -5,11 +5,11 @@ worse than none. It reads a name in two ways:
 
     spelling   Misspelt words, such as "nigthstand". The edits lie within words, and their number
                depends on the length of the word. English words are misspelt only in a known phrase:
-               "ceiling fun". Another entry at a similar distance makes the name ambiguous,
-               unless it is much rarer.
+               "power stripe". Another entry at a similar distance makes the name ambiguous, unless
+               it is much rarer.
     head       The last words of a phrase, such as "office table", without words after a preposition
                ("table on wheels"). Modifiers alone decide nothing. The last word needs its sense: a
-               "surfboard" is no board, and a "ground plane" no airplane.
+               "jail cell" is no cell phone, and a "ground plane" no airplane.
 
 `NameIndex.nearest` returns plausible entries for error messages. The module does not compare word
 vectors, because the nearest class by cosine similarity is right for only 40 % of held-out aliases.
@@ -150,7 +150,7 @@ class NameIndex:
         word, label = head[0], self._labels[entry]
         if word in _AMBIGUOUS or (word in label and word != label):
             return False
-        # Most of the known names with this last word must be names of the entry or its kinds.
+        # Half of the known names with this last word must be names of the entry or its kinds.
         others = [row for row in self._by_head.get(word, ()) if len(self._words[row]) > 1]
         kinds = sum(self._is_kind(self._entries[row], entry) for row in others)
         return kinds + 1 >= _SAME_SENSE * len(others)

@@ -100,10 +100,11 @@ class Mapped(Reply):
     """similarity of the label and the class. 1 means that the rule is certain"""
     rule: Rule
     """how the service read the label. Certain rules: alias (`hall`), phrase (`bottle of milk`),
-    qualifier (`mouse_(computer_equipment)`), alternative (`sofa/couch`), article (`a chair`),
-    instance (`chair_12`), prompt (`a photo of a chair`). Guesses: spelling (`nigthstand`), head
-    (`office table`). `meaning`: the model predicts the weights of the word (`ottoman`) from the
-    classes of similar words. Its relations and places are those of `class`, the nearest of them.
+    qualifier (`mouse_(computer_equipment)`, `table_large`), alternative (`sofa/couch`), article
+    (`a chair`), instance (`chair_12`, `/World/Mug_2`), prompt (`a photo of a chair`). Guesses:
+    spelling (`nigthstand`), head (`office table`). `meaning`: the model predicts the weights of the
+    word (`ottoman`) from the classes of similar words. Its relations and places are those of
+    `class`, the nearest of them.
     Such an object is never an outlier"""
 
 
