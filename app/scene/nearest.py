@@ -61,13 +61,27 @@ _BY_HEAD: Final = 0.9  # factor if modifiers are unknown
 _SAME_SENSE: Final = 0.5  # share of the names with a last word that are kinds of one entry
 
 _PREPOSITIONS: Final = frozenset(
-    ("of", "with", "on", "in", "for", "behind", "under", "below", "above", "over", "near", "beside")
+    (
+        "of",
+        "with",
+        "on",
+        "in",
+        "at",
+        "for",
+        "behind",
+        "under",
+        "below",
+        "above",
+        "over",
+        "near",
+        "beside",
+    )
 )
 # These words join two objects: "stove and oven", and "vase with flowers" if both are known.
 _SEVERAL: Final = frozenset(("and", "or", "&", "+", *NEGATIONS))
 _TOGETHER: Final = frozenset(("with", "in"))
-# A part of a thing shows the thing: "piano lower part".
-_PARTS: Final = frozenset(("part", "lower", "upper"))
+# These words add nothing to the word before them: "piano lower part", "sandal type of shoe".
+_PARTS: Final = frozenset(("part", "lower", "upper", "type", "kind"))
 # A "toy trailer" is a toy, and a "puppet cat" is a puppet.
 _IMITATIONS: Final = frozenset(("toy", "stuffed", "plush", "puppet"))
 # A modifier changes the meaning of these words: a "baseball cap" is a hat, but not a "bottle cap".
