@@ -307,7 +307,7 @@ def _without_description(label: str) -> str:
 
 
 def _end_of_path(label: str) -> str:
-    """Return the last part of a path that names an object, or a label that is no path."""
+    """Return the last part of a path that names an object. Other labels stay unchanged."""
     parts = [part for part in _STEP.split(label) if part] or [label]
     is_path = _PATH.search(label) is not None or label_key(parts[0]) in _FOLDERS
     if not is_path or parts == [label] or _SPACED.search(label) is not None:

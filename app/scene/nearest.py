@@ -8,8 +8,8 @@ worse than none. It reads a name in two ways:
                "power stripe". Another entry at a similar distance makes the name ambiguous, unless
                it is much rarer.
     head       The last words of a phrase, such as "office table", without words after a preposition
-               ("table on wheels"). Modifiers alone decide nothing. The last word needs its sense: a
-               "jail cell" is no cell phone, and a "ground plane" no airplane.
+               ("table on wheels"). Modifiers alone decide nothing. The last word needs its sense:
+               "jail cell" does not mean a cell phone, nor "ground plane" an airplane.
 
 `NameIndex.nearest` returns plausible entries for error messages. The module does not compare word
 vectors, because the nearest class by cosine similarity is right for only 40 % of held-out aliases.

@@ -277,8 +277,6 @@ class Vocabulary:
         """Return the class or room type that an unknown label probably stands for, or None."""
         if not is_room and self.room_index(label) is not None:
             return None  # the "hall" of "dining hall" is a corridor
-        if not is_room and self.room_index(label) is not None:
-            return None  # the "hall" of "dining hall" is a corridor
         names = self._room_names if is_room else self._names
         guesses = (names.guess(name) for name in _names_to_guess(label))
         return next((guess for guess in guesses if guess is not None), None)
