@@ -61,21 +61,7 @@ _BY_HEAD: Final = 0.9  # factor if modifiers are unknown
 _SAME_SENSE: Final = 0.5  # share of the names with a last word that are kinds of one entry
 
 _PREPOSITIONS: Final = frozenset(
-    (
-        "of",
-        "with",
-        "on",
-        "in",
-        "at",
-        "for",
-        "behind",
-        "under",
-        "below",
-        "above",
-        "over",
-        "near",
-        "beside",
-    )
+    "of with on in at for behind under below above over near beside".split()  # noqa: SIM905
 )
 # These words join two objects: "stove and oven", and "vase with flowers" if both are known.
 _SEVERAL: Final = frozenset(("and", "or", "&", "+", *NEGATIONS))

@@ -81,7 +81,7 @@ def get(chain: Chain, path: str) -> Any:
 @lru_cache(maxsize=1024)
 def _paths(path: str) -> list[tuple[int, list[Step]]]:
     """Return pairs (n, steps): the steps of each path start at the nth object from the inside."""
-    pairs = []
+    pairs: list[tuple[int, list[Step]]] = []
     for one in path.split("|"):
         names = one.lstrip("^/").removeprefix(".").split(".")
         outer = sys.maxsize if one[:1] == "/" else 1 + one.count("^")
@@ -90,9 +90,9 @@ def _paths(path: str) -> list[tuple[int, list[Step]]]:
         elif "[]" in names:
             place = names.index("[]")
             rest = partial(_inside, ".".join(names[place + 1 :]))
-            pairs.append((outer, [*map(_step, names[:place]), rest]))
+            pairs.append((outer, [*(_step(name) for name in names[:place]), rest]))
         else:
-            pairs.append((outer, [*map(_step, names)] if names != [""] else []))
+            pairs.append((outer, [_step(name) for name in names if name]))
     return pairs
 
 
