@@ -24,6 +24,7 @@ from app.questions.reading import Limits, read_scene
 from app.scene.labels import label_key
 from app.scene.nearest import NameIndex
 from app.scene.vocabulary import Vocabulary
+from scene_client.records import FIELDS, TABLE
 from scene_client.schemas import MissingRequest, RoomsRequest
 from scene_client.schemas.requests import MAX_LABEL
 from tests.http.stores import VOCABULARY
@@ -41,6 +42,12 @@ def patterns() -> Iterator[tuple[str, re.Pattern[Any], str]]:
         for info in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             if not info.name.endswith("__main__"):
                 yield from _patterns_of(importlib.import_module(info.name))
+
+    for form in (*TABLE["lines"], *TABLE["refused"]):
+        for name in {"match", "drop"} & form.keys():
+            yield f"formats.json:{form['name']}", re.compile(form[name]), "fullmatch"
+    for name in FIELDS["scene"]:
+        yield "formats.json:scene", re.compile(name), "fullmatch"
 
 
 def _patterns_of(module: Any) -> Iterator[tuple[str, re.Pattern[Any], str]]:

@@ -19,7 +19,7 @@ IMAGE: Final = ("corners", "rows", "corner", "centre", "points", "spans", "radii
 SOLID: Final = ("position", "size", "turn", "axes", "matrix", "span", "yaw", "degrees", "about")
 """Parts of a box with a position."""
 
-_NONE: Final = frozenset(("", "nan", "null", "none", "n/a"))
+_NONE: Final = frozenset(("", "nan", "null", "none", "n/a", "inf", "-inf", "infinity"))
 
 
 def numeric(value: Any, what: str) -> float:
@@ -58,6 +58,9 @@ def image(kind: str, values: Any, what: str, theta: float = 0.0) -> Box | None:
     if kind == "spans":
         xs, ys = (numerics(one, what) for one in values)
     else:
+        if isinstance(values, list) and all(isinstance(one, Mapping) for one in values):
+            # Protocol buffers leave a 0 out.
+            values = [(one.get("x") or 0, one.get("y") or 0) for one in values]
         several = numerics(values, what)
         xs, ys = several[::2], several[1::2]
         if kind == "rows":  # y before x
@@ -66,6 +69,9 @@ def image(kind: str, values: Any, what: str, theta: float = 0.0) -> Box | None:
             return None
     if not xs or not all(map(math.isfinite, xs + ys)):
         return math.nan, math.nan, math.nan, math.nan
+    if kind == "circle":  # its centre and a point on it
+        radius = math.dist((xs[0], ys[0]), (xs[-1], ys[-1]))
+        return xs[0] - radius, ys[0] - radius, xs[0] + radius, ys[0] + radius
     if kind in ("corner", "centre", "radii"):
         (x, width), (y, height) = xs, ys
         if kind == "radii":
@@ -95,7 +101,8 @@ def solid(form: Mapping[str, Any], values: Mapping[str, Any], what: str) -> Soli
         parts["turn"] = [*quaternion_of(axes)]
     if (span := parts.get("span")) and all(map(math.isfinite, span)):
         sides = [_side(span[axis::3]) for axis in range(3)]
-        parts |= {"size": sides} if any(sides) else {}
+        middle = [sum(_span(span[axis::3])) / 2 for axis in range(3)]
+        parts = {"position": middle, **parts} | ({"size": sides} if any(sides) else {})
     if "about" in parts:  # the y axis
         half = parts["about"][0] / 2
         parts["turn"] = [0.0, math.sin(half), 0.0, math.cos(half)]

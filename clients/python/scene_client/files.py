@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -198,6 +198,11 @@ def labels_in(text: str) -> dict[str, str | None]:
         raise MessageError("the label map does not contain labels") from None
 
 
+# An id and a label in a line, in this order or the other.
+_PAIR: Final = re.compile(r"(?P<id>\d+|/[mgt]/\w+)[\s:,;=]+(?P<label>\S.*)")
+_REVERSED: Final = re.compile(r"(?P<label>[^,;\t]+)[,;\t]+(?P<id>\d+)")
+
+
 def _names(text: str) -> Any:
     if text.lstrip()[:1] in ("{", "["):
         return _names_of(json_value(text))
@@ -207,22 +212,31 @@ def _names(text: str) -> Any:
             for entry in entries
         }
     lines = [line.strip() for line in text.splitlines() if not line.lstrip().startswith("#")]
-    pairs = [re.fullmatch(r"(\d+|/[mgt]/\w+)[\s:,;]+(\S.*)", line) for line in filter(None, lines)]
-    if pairs and all(pairs):
-        return {pair[1]: _without_comment(pair[2]) for pair in pairs if pair}
+    lines = [*filter(None, lines)]
+    for form in (_PAIR, _REVERSED):
+        pairs = [form.fullmatch(line) for line in lines]
+        pairs = pairs[1:] if len(pairs) > 1 and pairs[0] is None else pairs  # after a header
+        if pairs and all(pairs):
+            return {pair["id"]: _without_comment(pair["label"]) for pair in pairs if pair}
     if any(re.match(r"[\w/* -]+:(\s|$)|- |---", line) for line in lines):
         found = [_names_of(value) for value in yaml_values(text)]
         return next(filter(None, found), None)
-    return list(filter(None, lines))
+    return None if any("=" in line or "," in line for line in lines) else lines
+
+
+_MEMBERS: Final = {
+    name: re.compile(rf"\b{name}\s*:\s*(?:\"([^\"]*)\"|'([^']*)'|(\S+))")
+    for name in ("id", "name", "display_name")
+}
 
 
 def _member(entry: str, name: str) -> str:
-    found = re.search(rf"\b{name}\s*:\s*(?:\"([^\"]*)\"|'([^']*)'|(\S+))", entry)
+    found = _MEMBERS[name].search(entry)
     return next(filter(None, found.groups()), "") if found else ""
 
 
 def _without_comment(label: str) -> str:
-    return re.sub(r"\s+#.*", "", label).strip("'\"")
+    return label.partition(" #")[0].strip(" '\"")
 
 
 _NAMES: Final = (
@@ -231,21 +245,37 @@ _NAMES: Final = (
 )
 
 
-def _names_of(value: Any, depth: int = 0) -> Any:
+def _names_of(data: Any) -> Any:
     """Return the labels in data: a list, or a dictionary by class ids; None without labels."""
-    if isinstance(value, dict) and depth < 6:
-        named = [value[name] for name in _NAMES if name in value]
-        if not named and all(isinstance(label, str) for label in value.values()):
+    for value in (data, *_inner(data, 6)):
+        members = value if isinstance(value, dict) else {}
+        named = next((members[name] for name in _NAMES if name in members), None)
+        if (labels := _labels_of(named)) is not None:
+            return labels
+    return _labels_of(data)
+
+
+def _inner(value: Any, depth: int) -> Iterator[Any]:
+    for part in value.values() if isinstance(value, dict) and depth else ():
+        yield part
+        yield from _inner(part, depth - 1)
+
+
+def _labels_of(value: Any) -> Any:
+    if isinstance(value, dict) and value:
+        if all(isinstance(label, str) for label in value.values()):
             return value
-        if not named and all(type(number) is int for number in value.values()):
-            return {number: label for label, number in value.items()}  # from labels to ids
-        found = (_names_of(one, depth + 1) for one in named or value.values())
-        return next(filter(None, found), None)
-    if not isinstance(value, list) or not value:
+        if all(type(number) is int for number in value.values()):  # from labels to ids
+            return {number: label for label, number in value.items()}
         return None
-    if isinstance(value[0], dict):
-        return {one.get("id", n): one["name"] for n, one in enumerate(value)}
-    return value
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        if {"box", "bbox", "score", "confidence"} & value[0].keys():  # detections
+            return None
+        return {
+            one.get("id", one.get("class_id", n)): one.get("name", one.get("class_name"))
+            for n, one in enumerate(value)
+        }
+    return value if isinstance(value, list) and value else None
 
 
 # -------------------------------------------------------------------------------------- contents

@@ -15,8 +15,8 @@ from itertools import islice
 from typing import Any, Final, TypeVar
 
 from scene_client.image_plane import left_pairs
-from scene_client.parsing import Xml
-from scene_client.paths import leads
+from scene_client.parsing import Xml, Yaml
+from scene_client.paths import LOOKED_AT, leads
 from scene_client.records import (
     FIELDS,
     FORMATS,
@@ -25,10 +25,11 @@ from scene_client.records import (
     Form,
     Record,
     Rows,
+    names_scene,
     read,
     records_of,
 )
-from scene_client.ros_fields import REMEDY, LabelMap, MessageError, read_label_map, unwrapped
+from scene_client.ros_fields import REMEDY, LabelMap, MessageError, read_label_map, short, unwrapped
 from scene_client.schemas import Detection
 from scene_client.sightings import MAX_OBJECTS, SceneFields, to_fields
 from scene_client.special_formats import SPECIAL, rows_of
@@ -68,10 +69,13 @@ def scenes_in(data: Any, label_map: LabelMap | None = None) -> dict[str, Reader]
     form = data.form if isinstance(data, Rows) else None
     if form in (None, RECORDS):
         form = form_of(data)
-    if form is None and (path := _path_of_records(data)) is not None:
-        form = RECORDS | {"items": path}
+    form = form or _form_of_records(data)
     if form is None and _is_label_map(data):
         form = LABEL_MAP
+    if form is None and _has_rooms(data):
+        return {room: partial(_with_labels, {"objects": data[room]}, label_map) for room in data}
+    if form is None and isinstance(data, list) and data and form_of(data[0]) is not None:
+        return {str(n): partial(from_data, one, label_map) for n, one in enumerate(data, 1)}
     if form is None:
         return {"": partial(_with_labels, _request(data), label_map)}
     if "use" in form:
@@ -108,12 +112,23 @@ def chosen(scenes: Mapping[str, Reader], scene: object, file: str = "") -> Reade
         if str(scene) == "1":
             return scenes[""]
         raise MessageError(f"the file has one scene, and no scene {scene}")
-    names = ", ".join(islice(scenes, 5)) + (", …" if len(scenes) > 5 else "")
-    first = next(iter(scenes), "")
+    names = ", ".join(short(name) for name in islice(scenes, 5)) + ", …" * (len(scenes) > 5)
+    first = short(next(iter(scenes), ""))
     how = f"{file}:{first}" if file else f"scene={first!r}"
     problem = "" if scene is None else f"no scene {scene}; it has "
     raise MessageError(
         f"the file has {problem}{len(scenes)} scenes ({names}): choose one, such as {how}"
+    )
+
+
+def _has_rooms(data: Any) -> bool:
+    return (
+        isinstance(data, dict)
+        and len(data) > 1
+        and all(
+            isinstance(labels, list) and labels and all(isinstance(label, str) for label in labels)
+            for labels in data.values()
+        )
     )
 
 
@@ -125,26 +140,52 @@ def _is_label_map(data: Any) -> bool:
     )
 
 
-def _path_of_records(data: Any) -> str | None:
-    """Return the path of the only list of records in data, or None."""
-    if isinstance(data, Rows) or are_records(data):
-        return "[]"
-    members = data.items() if isinstance(data, dict) else ()
-    lists = [name for name, value in members if are_records(value)]
-    return f"{lists[0]}.[]" if len(lists) == 1 else None
+_DEEPEST: Final = 3  # lists and objects around records
 
 
-def are_records(data: Any) -> bool:
-    """Return whether data is a list of objects of a detector, and not those of a request."""
+def _form_of_records(data: Any) -> Form | None:
+    """Return the format of the only list of records in data, or of the only lists of one kind."""
+    if isinstance(data, Rows):
+        return RECORDS
+    paths = _paths_of_records(data, _DEEPEST)
+    if len(paths) != 1:
+        return None
+    (path,) = paths
+    is_several = path.count("[]") + path.count("*") > 1
+    return RECORDS | {"items": path} | ({"scene": "^.@"} if is_several else {})
+
+
+def _paths_of_records(data: Any, depth: int, name: str = "") -> set[str]:
+    if are_records(data, name):
+        return {"[]"}
+    inner: list[tuple[str, set[str]]] = []
+    if isinstance(data, list) and depth:
+        inner = [("[]", _paths_of_records(one, depth - 1)) for one in data[:LOOKED_AT]]
+    elif isinstance(data, dict) and depth:
+        inner = [(key, _paths_of_records(one, depth - 1, key)) for key, one in data.items()]
+        if len(inner) > 1 and all(paths == {"[]"} for _, paths in inner):  # by images or rooms
+            return {"*.[]"}
+    return {f"{step}.{path}" for step, paths in inner for path in paths}
+
+
+def are_records(data: Any, name: str = "") -> bool:
+    """Return whether data is a list of objects of a detector, and not those of a request.
+
+    ``name`` is the name of the list, which is `objects` in a request.
+    """
     if not isinstance(data, list) or not data or not all(isinstance(one, dict) for one in data):
         return False
     first = Record(((None, data), (0, data[0])))
     if first.first("label") is None or data[0].keys() <= _REQUESTED:
         return False
-    # An object with a label can be one of a request, with a misspelt field.
-    shared = {"position", "confidence"} if "label" in data[0] else set()
-    names = {*FIELDS["position"], *FIELDS["score"], *(name for _, name in FIELDS["image"])} - shared
-    return any(first.take(name) is not None for name in names)
+    names = {*FIELDS["position"], *FIELDS["score"], *(name for _, name in FIELDS["image"])}
+    if "label" in data[0]:
+        # The object can be one of a request, with a misspelt field.
+        names -= {"position", "confidence"}
+        others = data[0].keys() - _REQUESTED if name != "objects" else set()
+        if others & {*first.unread()} or any(names_scene(one) is not None for one in others):
+            return True
+    return any(first.take(name) is not None for name in (*FIELDS["span"], *names))
 
 
 def _converted(
@@ -198,13 +239,14 @@ def _request(data: Any) -> dict[str, Any]:
 
 def _kind(data: Any) -> str:
     if isinstance(data, Xml):
-        return f"XML with the root <{next(iter(data))[:40]}>"
+        return f"XML with the root <{short(next(iter(data)))}>"
     is_list = isinstance(data, list)
     one, kind = (data[0], "list of objects") if is_list and data else (data, "object")
     if not isinstance(one, dict):
         return "a JSON list" if is_list else "a JSON value"
-    names = ", ".join(str(name)[:24] for name in islice(one, 5))
-    return f"a JSON {kind} with the fields {names}" if names else f"an empty JSON {kind}"
+    names = ", ".join(short(str(name)) for name in islice(one, 5))
+    kind = "YAML" if isinstance(data, Yaml) else f"a JSON {kind}"
+    return f"{kind} with the fields {names}" if names else f"{kind} without fields"
 
 
 def _signs(form: Form, data: Any) -> float:

@@ -8,6 +8,8 @@ import io
 import json
 import re
 from collections.abc import Callable
+from contextlib import suppress
+from copy import copy
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
@@ -15,7 +17,7 @@ from typing import Any, Final
 from xml.etree import ElementTree
 
 from scene_client.boxes import NUMBER
-from scene_client.records import FIELDS, TABLE, Form, Rows, key_of
+from scene_client.records import FIELDS, TABLE, Form, Rows, key_of, pattern
 from scene_client.ros_fields import MessageError
 
 _MOST_YAML: Final = 2**19  # bytes; PyYAML is slow
@@ -24,10 +26,13 @@ MOST_MESSAGES: Final = 2**26
 
 _PART: Final = 2**16  # characters of XML
 _START: Final = 2000  # characters in which a refused format shows
-_BEFORE: Final = r"\s*(?:<\?xml[^>]*>\s*)?(?:<!--(?:(?!-->).)*-->\s*)?"
+_BEFORE: Final = r"(?is)\s*(?:<\?xml[^>]*>\s*)?(?:<!--(?:(?!-->).)*-->\s*)?(?:#\s[^\n]*\n\s*)*"
 _FENCE: Final = re.compile(r"```(?:\w+)?[ \t]*\n(.*?)```", re.DOTALL)
+_COMMENT: Final = re.compile(r"#(\s|$)")
 _ITEM: Final = re.compile(r"(?:[-*•+]|\d{1,3}[.)])[ \t]+(?=\S)")
-_YAML: Final = re.compile(r"(---\s|- |[\w./ -]{1,64}:(\s|$))")
+_YAML: Final = re.compile(r"---(\s|$)|- |[\w./ -]{1,64}:(\s|$)")
+_DEEPEST: Final = 64  # nesting of YAML and XML
+_LONGEST: Final = 5  # words of a label; more of them are a sentence
 
 
 def parsed(content: bytes) -> Any:
@@ -50,6 +55,10 @@ class Xml(dict[str, Any]):
     """The root of a file in XML, by its name."""
 
 
+class Yaml(dict[str, Any]):
+    """A value of a file in YAML."""
+
+
 def text_of(content: bytes) -> str:
     """Return the text of a file in UTF-8, or in UTF-16 with a mark of its byte order.
 
@@ -58,33 +67,38 @@ def text_of(content: bytes) -> str:
     """
     is_wide = content.startswith((b"\xff\xfe", b"\xfe\xff"))
     try:
-        return content.decode("utf-16" if is_wide else "utf-8-sig")
+        text = content.decode("utf-16" if is_wide else "utf-8-sig")
     except UnicodeDecodeError:
-        raise MessageError("this is no text in UTF-8, and no other known format") from None
+        text = "\0"
+    if "\0" in text:
+        raise MessageError("this is no text in UTF-8, and no other known format")
+    return text
 
 
 def _refuse(start: str) -> None:
     for form in TABLE["refused"]:
-        if re.match(rf"{_BEFORE}(?:{form['match']})", start, re.IGNORECASE | re.DOTALL):
+        if pattern(f"{_BEFORE}(?:{form['match']})").match(start):
             raise MessageError(f"this is {form['name']}: {form['use']}")
 
 
 def _data(text: str) -> Any:
-    if (fence := _FENCE.search(text)) is not None:  # of a language model
-        text = fence[1]
+    if len(blocks := _FENCE.findall(text)) > 1:  # of a language model
+        return Parts({str(n): partial(_data, block) for n, block in enumerate(blocks, 1)})
+    text = blocks[0] if blocks else text
     start = text.lstrip()[:1]
     if start == "<":
         return _xml(text)
     if start in ("{", "["):
         return _json(text)
     lines = [line.strip() for line in text.splitlines() if line.strip()]
+    lines = [line for line in lines if not _COMMENT.match(line)]
     if not lines:
         raise MessageError("the file is empty")
     for parse in (_table, _numbers, _lines, _labels):
         if (data := parse(lines)) is not None:
             return data
-    if _YAML.match(text):
-        return _yaml(text)
+    if _YAML.match(lines[0]) and (data := _yaml(text)) is not None:
+        return data
     raise MessageError(_what_text(lines))
 
 
@@ -97,12 +111,12 @@ def _json(text: str) -> Any:
             pass
         else:
             lines = enumerate(text.split("\n"), 1)
-            return Parts({str(n): partial(json_value, line) for n, line in lines if line.strip()})
+            return Parts({str(n): partial(json_value, one, n) for n, one in lines if one.strip()})
     return json_value(text)
 
 
-def json_value(text: str) -> Any:
-    """Return the value of a text in JSON.
+def json_value(text: str, line: int = 1) -> Any:
+    """Return the value of a text in JSON. ``line`` is the number of its first line.
 
     Raises:
         MessageError: the text is not JSON.
@@ -112,7 +126,9 @@ def json_value(text: str) -> Any:
     except RecursionError:
         raise MessageError("this is not JSON that can be read: its nesting is too deep") from None
     except json.JSONDecodeError as error:
-        where = f"line {error.lineno}, column {error.colno}"
+        if (value := _of_python(text)) is not None:
+            return value
+        where = f"line {line + error.lineno - 1}, column {error.colno}"
         end = "; the file ends too early" if error.pos >= len(text.rstrip()) - 1 else ""
         raise MessageError(f"this is not JSON that can be read: see {where}{end}") from None
     except ValueError:
@@ -125,6 +141,8 @@ def json_value(text: str) -> Any:
 def _table(lines: list[str]) -> Rows | None:
     """Return the rows of a table, or None if the first line does not name the columns."""
     delimiter = max(",;\t|", key=lines[0].count)
+    if delimiter == "|":  # of Markdown
+        lines = [one.strip("| ") for one in lines if not re.fullmatch(r"[|:\- ]+", one)]
     names = [name.strip().strip('"') for name in lines[0].split(delimiter)]
     keys = [key_of(name) for name in names]
     if len(names) < 2 or not set(FIELDS["label"]) & {*keys} or any(map(_is_number, names)):
@@ -150,13 +168,20 @@ def _cell(cell: str, has_commas: bool) -> Any:
     cell = cell.strip()
     if has_commas and re.fullmatch(r"[+-]?\d+,\d+", cell):
         return cell.replace(",", ".")
-    if cell.startswith(("[{", "{")) and len(cell) < _START * 32:
-        for load in (json.loads, ast.literal_eval):  # a dictionary of Python has other quotes
-            try:
-                return load(cell)
-            except (ValueError, SyntaxError, RecursionError, MemoryError):
-                continue
+    if cell.startswith(("[{", "{")):
+        with suppress(MessageError):
+            return json_value(cell)
     return cell
+
+
+def _of_python(text: str) -> Any:
+    """Return the value of dictionaries as Python prints them, or None for other text."""
+    if not re.match(r"\s*\[?\{'", text) or len(text) > _START * 32:
+        return None
+    try:
+        return ast.literal_eval(text.strip())
+    except (ValueError, SyntaxError, RecursionError, MemoryError):
+        return None
 
 
 def _numbers(lines: list[str]) -> Rows | None:
@@ -164,15 +189,16 @@ def _numbers(lines: list[str]) -> Rows | None:
     words = [line.split() for line in lines]
     if not all(len(line) >= 5 and all(map(_is_number, line)) for line in words):
         return None
-    return Rows(map(_yolo, words))
+    if not all(line[0].isdecimal() for line in words):
+        return None
+    last = {line[-1] for line in words if len(line) in (6, 7)}
+    has_tracks = all(map(str.isdecimal, last)) and bool(last - {"0", "1"} or len(last) > 1)
+    return Rows(_yolo(line, has_tracks and len(line) in (6, 7)) for line in words)
 
 
-def _yolo(words: list[str]) -> dict[str, Any]:
+def _yolo(words: list[str], has_track: bool) -> dict[str, Any]:
+    track = words.pop() if has_track else ""
     label, values = words[0], [float(word) for word in words[1:]]
-    track = ""
-    if len(values) == 6 and values[5].is_integer() and max(values[:5]) <= 1:
-        track = words.pop()
-        values.pop()
     score = values.pop() if len(values) % 2 else 1.0
     box = {"xcenter": 0, "ycenter": 1, "width": 2, "height": 3}
     shape = {n: values[at] for n, at in box.items()} if len(values) == 4 else {"points": values}
@@ -183,9 +209,14 @@ def _lines(lines: list[str]) -> Rows | None:
     """Return the rows of lines in one of the formats of the table."""
     for form in TABLE["lines"]:
         if "match" in form:
-            kept = [line for line in lines if not re.fullmatch(form["drop"], line)]
-            found = [re.fullmatch(form["match"], line) for line in kept]
-            rows = [one.groupdict() for one in found if one]
+            kept, found, image = [], [], ""
+            for line in lines:
+                if head := pattern(form["drop"]).fullmatch(line):
+                    image = head[1] or image
+                else:
+                    kept.append(line)
+                    found.append((image, pattern(form["match"]).fullmatch(line)))
+            rows = [{"image": image, **one.groupdict()} for image, one in found if one]
         else:
             names = form["words"].split()
             rows = [row for line in lines if (row := _row(line.split(), names, form)) is not None]
@@ -206,27 +237,34 @@ def _row(words: list[str], names: list[str], form: Form) -> dict[str, str] | Non
     return dict(zip(names, [" ".join(words[:count]), *numbers], strict=False))
 
 
-def _labels(lines: list[str]) -> list[str] | None:
+def _labels(lines: list[str]) -> list[str] | dict[str, str] | None:
     """Return the labels of a list or a caption: one a line, or with separators between them."""
     if len(lines) == 1:
         separators = (" | ", " . ", ",")
         separator = max(separators, key=lines[0].count)
-        labels = lines[0].rstrip(" .").split(separator)
+        if lines[0].endswith(".") and separator == ",":  # a sentence
+            return None
+        labels = [one.removeprefix("and ") for one in lines[0].rstrip(" .").split(separator)]
     elif all(map(_ITEM.match, lines)):
         labels = [_ITEM.sub("", line, count=1) for line in lines]
     else:
         labels = [label for line in lines for label in line.split(",")]
     labels = [label.strip() for label in labels if label.strip()]
+    numbered = [re.fullmatch(r"(\d+)[\s,;:=]+(\D.*)", line) for line in lines]
+    numbers = [int(one[1]) for one in numbered if one]
+    if len(numbers) == len(lines) and numbers in ([*range(n, n + len(lines))] for n in (0, 1)):
+        return {one[1]: one[2] for one in numbered if one}  # a label map
     if any(map(_is_no_label, labels)):
         return None
     return labels
 
 
 def _is_no_label(label: str) -> bool:
-    """Return whether a text has marks of data, or a number as a word of its own."""
-    return bool(re.search(r'[{}\[\]":<=]', label)) or any(
-        _is_number(word.strip("()%,;")) for word in label.split()
-    )
+    """Return whether a text is a sentence, or has marks of data or a number as a word."""
+    words = label.split()
+    has_number = any(_is_number(word.strip("()%,;")) for word in words)
+    has_marks = re.search(r'[{}\[\]":<=#!?]|\*\*|\.\s', label) is not None
+    return has_number or has_marks or len(words) > _LONGEST or label in ("null", "true", "false")
 
 
 def _is_number(word: str) -> bool:
@@ -261,12 +299,13 @@ def extra(module: str) -> Any:
 
 
 def _yaml(text: str) -> Any:
-    if len(text) > _MOST_YAML:
-        raise MessageError(f"this is YAML of more than {_MOST_YAML} characters: convert it to JSON")
-    values = [value for value in yaml_values(text) if value is not None]
+    """Return the value of a text in YAML, or None for other text."""
+    values = [value for value in yaml_values(text) if value not in (None, "")]
+    if not all(isinstance(value, dict | list) for value in values):
+        return None
     if len(values) == 1:
-        return values[0]
-    return Parts({str(n): partial(dict, value) for n, value in enumerate(values, 1)})
+        return Yaml(values[0]) if isinstance(values[0], dict) else values[0]
+    return Parts({str(n): partial(copy, value) for n, value in enumerate(values, 1)})
 
 
 def yaml_values(text: str) -> list[Any]:
@@ -276,17 +315,39 @@ def yaml_values(text: str) -> list[Any]:
         MessageError: the text is not YAML, or has anchors, or PyYAML is not installed.
     """
     yaml = extra("yaml")
+    if len(text) > _MOST_YAML:
+        raise MessageError(f"this is YAML of more than {_MOST_YAML} characters: convert it to JSON")
+    depth, deepest = 0, max(len(line) - len(line.lstrip(" -?")) for line in text.splitlines())
+    for mark in re.findall(r"[\[\]{}]", text):
+        depth += 1 if mark in "[{" else -1
+        deepest = max(deepest, 2 * depth)
+    if deepest > 2 * _DEEPEST:
+        raise MessageError("this is YAML that cannot be read: its nesting is too deep")
     try:
         # An alias stands for a part of the document again. A small text could mean a huge value.
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.BaseLoader)):
             raise MessageError("this is YAML with aliases (*), which this program does not read")
-        return [*yaml.safe_load_all(text)]
+        # The other loaders read the label "no" as a boolean.
+        return [_typed(value) for value in yaml.load_all(text, yaml.BaseLoader)]
+    except MessageError:
+        raise
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        if isinstance(error, MessageError):
-            raise
         mark = getattr(error, "problem_mark", None)
         where = f": see line {mark.line + 1}" if mark else ""
         raise MessageError(f"this is not YAML that can be read{where}") from None
+
+
+def _typed(value: Any) -> Any:
+    """Return a value of YAML with numbers in place of their texts."""
+    if isinstance(value, dict):
+        return {key: _typed(part) for key, part in value.items()}
+    if isinstance(value, list):
+        return [_typed(part) for part in value]
+    if value in ("", "~", "null"):
+        return "" if value == "" else None
+    if NUMBER.fullmatch(value):
+        return int(value) if re.fullmatch(r"[+-]?\d{1,18}", value) else float(value)
+    return value
 
 
 def _xml(text: str) -> Any:
@@ -302,7 +363,10 @@ def _xml(text: str) -> Any:
     except ElementTree.ParseError as error:
         line = error.position[0]
         raise MessageError(f"this is not XML that can be read: see line {line}") from None
-    return Xml({root.tag: _element(root)})
+    try:
+        return Xml({root.tag: _element(root)})
+    except RecursionError:
+        raise MessageError("this is XML that cannot be read: its nesting is too deep") from None
 
 
 def _element(element: ElementTree.Element) -> Any:

@@ -5,7 +5,6 @@ Each function raises a `PydanticCustomError`, which is a `ValueError`, for a tex
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from difflib import get_close_matches
 from typing import Any, Final, get_args
@@ -29,11 +28,7 @@ _SPOKEN: Final[dict[str, RelationName]] = {
     "to the left of": "left", "to the right of": "right", "on": "on-top", "in": "inside",
 }  # fmt: skip
 # Longer words come first, because "on" begins "on top of".
-_ANY: Final = "|".join(re.escape(words) for words in sorted(_SPOKEN, key=len, reverse=True))
-# A name has at most 128 characters, so the patterns need no long searches.
-_NAME: Final = r"(?:the\s+)?(\S.{0,127}?)"
-_PLACE: Final = re.compile(rf"\s*({_ANY})\s+{_NAME}\s*")
-_RELATION: Final = re.compile(rf"\s*{_NAME}(?:\s+(?:is|are))?\s+{_PLACE.pattern}")
+_LONGEST_FIRST: Final = sorted(_SPOKEN, key=len, reverse=True)
 
 
 def relation(text: str) -> dict[str, str]:
@@ -41,20 +36,39 @@ def relation(text: str) -> dict[str, str]:
 
     The first relation in the text separates the labels, which may contain spaces.
     """
-    match = _RELATION.fullmatch(text)
-    if match is None:
-        rule = 'must be a subject, a relation and an object, as in "lamp on-top desk"'
-        raise _error(f"{rule}; {_names_for(text.split()[1:-1])}")
-    return {"subject": match[1], "relation": _SPOKEN[match[2]], "object": match[3]}
+    words = text.split()
+    for start in range(1, len(words) - 1):
+        name, end = _relation_at(words, start)
+        if name and (thing := _name(words[end:])):
+            subject = words[:start]
+            if len(subject) > 1 and subject[-1] in ("is", "are"):
+                subject = subject[:-1]
+            return {"subject": _name(subject), "relation": name, "object": thing}
+    rule = 'must be a subject, a relation and an object, as in "lamp on-top desk"'
+    raise _error(f"{rule}; {_names_for(words[1:-1])}")
 
 
 def place(text: str) -> dict[str, str]:
     """Return the relation and the object of a text such as "on-top desk"."""
-    match = _PLACE.fullmatch(text)
-    if match is None:
-        rule = 'must be a relation and an object, such as "on-top desk"'
-        raise _error(f"{rule}; {_names_for(text.split()[:1])}")
-    return {"relation": _SPOKEN[match[1]], "object": match[2]}
+    words = text.split()
+    name, end = _relation_at(words, 0)
+    if name and (thing := _name(words[end:])):
+        return {"relation": name, "object": thing}
+    rule = 'must be a relation and an object, such as "on-top desk"'
+    raise _error(f"{rule}; {_names_for(words[:1])}")
+
+
+def _relation_at(words: list[str], start: int) -> tuple[str, int]:
+    """Return the relation that starts at a word and the index after it, or ("", start)."""
+    for spoken in _LONGEST_FIRST:
+        end = start + spoken.count(" ") + 1
+        if words[start:end] == spoken.split():
+            return _SPOKEN[spoken], end
+    return "", start
+
+
+def _name(words: list[str]) -> str:
+    return " ".join(words[1:] if words[:1] == ["the"] and len(words) > 1 else words)
 
 
 def search(text: str) -> dict[str, Any]:

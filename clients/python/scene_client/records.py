@@ -11,7 +11,7 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping
-from functools import cached_property
+from functools import cached_property, lru_cache
 from importlib.resources import files
 from typing import Any, Final
 
@@ -19,7 +19,7 @@ from scene_client.boxes import IMAGE, NUMBER, SOLID, image, numeric, numerics, s
 from scene_client.image_plane import Box
 from scene_client.paths import LOOKED_AT, Chain, each, get, leads
 from scene_client.ros_fields import frame_of, members, number, take, text, time_of
-from scene_client.sightings import Note, Reason, Seen, Sighting, Solid
+from scene_client.sightings import MAX_OBJECTS, Note, Reason, Seen, Sighting, Solid
 
 Form = dict[str, Any]
 """An entry of the table of formats."""
@@ -33,8 +33,11 @@ LABEL_MAP: Final[Form] = FORMATS[-1]
 FIELDS: Final[dict[str, Any]] = TABLE["fields"]
 """Usual names of each kind of field, in the form of `key_of`."""
 
-_CARRIES: Final = re.compile(FIELDS["carries"])
+_SCENES: Final = [re.compile(pattern) for pattern in FIELDS["scene"]]  # places, frames, times
+_UNITS: Final[dict[str, float]] = FIELDS["units"]
+_CARRIES: Final[list[str]] = FIELDS["carries"]  # parts of the names of decisive fields
 _MOST_NAMES: Final = 8  # of unread fields in a note
+_MOST_RECORDS: Final = 4 * MAX_OBJECTS  # some have no label
 _TURN: Final = 6.3  # radians; a larger yaw is in degrees
 
 
@@ -51,6 +54,10 @@ def matches(form: Form, data: Any) -> bool:
     return "has" in form and all(leads(path, data) for path in form["has"])
 
 
+pattern = lru_cache(maxsize=256)(re.compile)
+"""A function that returns a pattern of the table; it compiles each one once."""
+
+
 def spot(chain: Chain, spec: Any) -> Any:
     """Return the value that a format describes: paths, "x,y,z", or a path and a pattern."""
     if isinstance(spec, list):
@@ -59,7 +66,7 @@ def spot(chain: Chain, spec: Any) -> Any:
         value = get(chain, spec["path"])
         if "match" not in spec or not isinstance(value, str):
             return value
-        found = re.search(spec["match"], value)
+        found = pattern(spec["match"]).search(value)
         return found[1] if found else None
     if "," not in spec:
         return get(chain, spec) if spec else None
@@ -72,7 +79,22 @@ def spot(chain: Chain, spec: Any) -> Any:
 
 def key_of(name: str) -> str:
     """Return the name of a field without capitals and separators."""
-    return re.sub(r"[\W_]", "", name).lower()
+    return "".join(filter(str.isalnum, name)).lower()
+
+
+@lru_cache(maxsize=1024)
+def with_unit(name: str) -> tuple[str, float | None]:
+    """Return the key of a name, and the factor of its unit, as in "x [mm]", or None."""
+    stem = name.rstrip("])")
+    end = max(map(stem.rfind, " _[("))
+    factor = _UNITS.get(stem[end + 1 :]) if end > 0 else None
+    return key_of(name if factor is None else stem[:end]), factor
+
+
+def names_scene(name: str) -> int | None:
+    """Return 0 for the name of a place, 1 for that of a frame, 2 for that of a time, or None."""
+    key = key_of(name)
+    return next((kind for kind, one in enumerate(_SCENES) if one.fullmatch(key)), None)
 
 
 class Record:
@@ -94,7 +116,9 @@ class Record:
         nodes = [("", self.node, 0)]
         for owner, node, depth in nodes:
             for name, value in members(node):
-                key = key_of(name)
+                key, factor = with_unit(name)
+                if factor is not None and _is_plain(value):
+                    value = factor * numeric(value, name)
                 fields.setdefault(key, (owner + name, value))
                 if key in FIELDS["inside"] and depth < 3 and not isinstance(value, list | str):
                     nodes.append((f"{owner}{name}.", value, depth + 1))
@@ -121,7 +145,10 @@ class Record:
         for key, (name, value) in self.fields.items():
             is_empty = value is None or value == "" or value == [] or value == {}
             is_used = any(one == name or one.startswith(f"{name}.") for one in self.used)
-            if not (is_empty or is_used or "." in name) and _CARRIES.search(key):
+            axes = ({key[:-1] + axis for axis in "xyz"}, {axis + key[1:] for axis in "xyz"})
+            is_axis = any(key in names and names <= self.fields.keys() for names in axes)
+            carries = is_axis or key in FIELDS["carrying"] or any(map(key.__contains__, _CARRIES))
+            if carries and not (is_empty or is_used or "." in name):
                 yield name
 
 
@@ -160,13 +187,28 @@ def _scene_names(form: Form, records: list[Record]) -> list[str]:
         if str(form["scene"]).endswith("@"):
             return [str(key + 1 if isinstance(key, int) else key) for key in found]
         return ["" if name is None else str(name) for name in found]
-    columns: list[list[str]] = []
-    for name in () if _is_named(form) else FIELDS["scene"]:
-        column = [str(value) if _is_plain(value := one.take(name)) else "" for one in records]
-        is_text = name == "frameid" and not all(map(NUMBER.fullmatch, filter(None, column)))
-        if len({*column}) > 1 and not is_text and (name not in FIELDS["time"] or not columns):
-            columns.append(column)
-    return [", ".join(names) for names in zip(*columns, strict=True)] or [""] * len(records)
+    if _is_named(form):
+        return [""] * len(records)
+    names = dict.fromkeys(name for one in records[:LOOKED_AT] for name in one.fields)
+    varying: list[list[list[str]]] = [[], [], []]  # columns of places, of frames and of times
+    for name in names:
+        kind = names_scene(name)
+        if kind is not None and (column := _column(name, records)) is not None:
+            varying[kind].append(column)
+    # The times of the objects of one frame may differ.
+    columns = varying[0] + (varying[1] or varying[2])
+    return [", ".join(parts) for parts in zip(*columns, strict=True)] or [""] * len(records)
+
+
+def _column(name: str, records: list[Record]) -> list[str] | None:
+    """Return the values of a field that names scenes, or None if they are equal or a frame."""
+    values = [one.take(name) for one in records]
+    column = [
+        str(value) if _is_plain(value) else ".".join(map(str, (time_of(value) or {}).values()))
+        for value in values
+    ]
+    is_frame = name in FIELDS["frame"] and not all(map(NUMBER.fullmatch, filter(None, column)))
+    return None if len({*column}) < 2 or is_frame else column
 
 
 def _is_named(form: Form) -> bool:
@@ -204,6 +246,11 @@ class _Reader:
         if "group" in form:
             chosen = _merged(chosen, form["group"])
         scores, sightings = self.scores(chosen), []
+        left_out = max(0, len(chosen) - _MOST_RECORDS)
+        if left_out:  # most boxes need no conversion
+            ranks = [-(number(score) or 0) for score in scores]
+            kept = sorted(sorted(range(len(chosen)), key=ranks.__getitem__)[:_MOST_RECORDS])
+            chosen, scores = [chosen[n] for n in kept], [scores[n] for n in kept]
         for n, record in enumerate(chosen):
             what = f"object {n + 1}"
             if isinstance(self.data, Rows):
@@ -226,19 +273,16 @@ class _Reader:
         stamp = next(filter(None, (self.stamp(one) for one in chosen[:1])), stamp)
         self.note_unread(chosen)
         is_list = form["name"] == RECORDS["name"] and not isinstance(self.data, Rows)
-        if is_list and not any(one.solid or one.image for one in sightings):
+        if is_list and not any(one.solid or one.image for one in sightings) and not self.notes:
             self.note("no-box", "there are no boxes: the results of a classifier are no objects")
         is_solid = form.get("is_solid")
-        return Seen(sightings, frame, stamp, self.viewer(), is_solid, self.notes)
+        return Seen(sightings, frame, stamp, self.viewer(), is_solid, self.notes, left_out)
 
     def _chosen(self, records: list[Record]) -> list[Record]:
         """Return the records without those that the format marks as no objects."""
         skip = dict(self.form.get("skip", {}))
         what = skip.pop("what", "")
-        chosen = [
-            one for one in records
-            if not any(get(one.chain, path) in values for path, values in skip.items())
-        ]  # fmt: skip
+        chosen = [one for one in records if not any(_is(one, *pair) for pair in skip.items())]
         bare = self.form.get("bare", {"items": []})
         found = (one for path in bare["items"] for one in each(self.data, path))
         others = sum(get(one, bare.get("lacks", "-")) is None for one in found)
@@ -266,8 +310,9 @@ class _Reader:
                 score = numeric(score.strip(" %"), f"object {n}, the score")
             scores.append(1.0 if score is None and "is_solid" not in self.form else score)
         finite = [value for one in scores if (value := number(one)) is not None]
-        has_parts = any(0 < score <= 1 for score in finite)
-        if not (is_percent or has_parts) and 1 < max(finite, default=0) <= 100:
+        above = [score for score in finite if score > 1.5]
+        is_alone = len(above) == 1 and any(0 < score < 1 for score in finite)
+        if above and not (is_percent or is_alone) and max(finite) <= 100:
             is_percent = True
             self.note("percent", "the scores count as percent")
         if is_percent:
@@ -292,6 +337,8 @@ class _Reader:
             return box, None
         kinds = ((kind, spot(chain, form[kind])) for kind in IMAGE if kind in form)
         kind, value = next(((kind, v) for kind, v in kinds if v is not None), ("", None))
+        if "circle" in form and get(chain, form["circle"]) == "circle":
+            kind = "circle"
         if kind and "scale" in form and kind != "spans":
             scale = numerics(spot(chain, form["scale"]) or [1.0, 1.0], what)
             value = [part * scale[n % 2] for n, part in enumerate(numerics(value, what))]
@@ -306,11 +353,16 @@ class _Reader:
 
     def found(self, record: Record, what: str) -> tuple[Solid | None, Box | None]:
         """Return the box of a record whose fields have usual names."""
-        for names in FIELDS["position"]:
+        for names in FIELDS["span"]:
             if (value := record.take(names)) is not None:
+                return solid(self.form, {"span": value}, f"{what}, {names}"), None
+        # A box x, y, w, h lies in an image, also with a further column z.
+        is_flat = {"w", "h"} <= record.fields.keys() and not {"d", "l"} & record.fields.keys()
+        for names in FIELDS["position"]:
+            if (value := None if is_flat and names == "x,y,z" else record.take(names)) is not None:
                 if len(numerics(value, f"{what}, {names}")) == 3:
                     values = {"position": value}
-                    for kind in ("size", "turn", "yaw", "degrees"):
+                    for kind in ("size", "turn", "yaw"):
                         values[kind] = record.first(kind)
                     values = {kind: value for kind, value in values.items() if value is not None}
                     return solid(self.form, values, what), None
@@ -342,8 +394,11 @@ class _Reader:
     def frame(self, record: Record) -> str:
         if "frame" in self.form:
             return text(get(record.chain, self.form["frame"])).lstrip("/")
-        frame = frame_of(take(record.node, "header")) or frame_of(record.node)
-        return "" if NUMBER.fullmatch(frame) else frame
+        if _is_named(self.form):
+            return frame_of(take(record.node, "header")) or frame_of(record.node)
+        found = (text(record.take(name)) for name in FIELDS["frame"])
+        frame = next((one for one in found if one and not NUMBER.fullmatch(one)), "")
+        return frame.lstrip("/")
 
     def stamp(self, record: Record) -> Any:
         if "stamp" in self.form or _is_named(self.form):
@@ -372,6 +427,12 @@ class _Reader:
             more = ", …" if len(unread) > _MOST_NAMES else ""
             named = ", ".join(unread[:_MOST_NAMES])[:200] + more
             self.note("unread", f"these fields are not read: {named}")
+
+
+def _is(record: Record, path: str, values: list[Any]) -> bool:
+    """Return whether a field has one of the values; "*" is any value."""
+    value = get(record.chain, path)
+    return value in values or (value is not None and values == ["*"])
 
 
 def _merged(records: list[Record], path: str) -> list[Record]:

@@ -99,6 +99,11 @@ def is_plain(value: str, longest: int) -> bool:
     return 0 < len(value) <= longest and value.isprintable()
 
 
+def short(name: str) -> str:
+    """Return the start of a name for a message, without unprintable characters."""
+    return "".join(letter if letter.isprintable() else "\ufffd" for letter in name[:40])
+
+
 def frame_of(header: Any) -> str:
     """Return the name of the frame in a std_msgs/Header, or "" if the header has no frame."""
     frame = take(header, "frame_id")

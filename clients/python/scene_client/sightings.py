@@ -126,6 +126,7 @@ class Seen:
         viewpoint: pose of the viewer, or None if unknown.
         is_solid: whether the boxes have positions, or lie in an image. None: as the boxes show.
         notes: notes on what the scene does not contain.
+        left_out: number of further sightings, which have lower scores.
     """
 
     sightings: list[Sighting]
@@ -134,6 +135,7 @@ class Seen:
     viewpoint: Viewpoint | None = None
     is_solid: bool | None = None
     notes: list[Note] = field(default_factory=list)
+    left_out: int = 0
 
 
 Viewpoint = tuple[float, float, float] | Mapping[str, float]
@@ -182,6 +184,7 @@ def to_fields(
 class _Converter:
     def __init__(self, seen: Seen, labels: Mapping[str, str | None], min_score: float) -> None:
         self.notes, self.labels, self.min_score = [*seen.notes], labels, min_score
+        self.left_out = seen.left_out
         every = seen.sightings
         for index, sighting in enumerate(every):
             sighting.index = index
@@ -227,9 +230,9 @@ class _Converter:
     def _most_confident(self, sightings: list[Sighting]) -> list[Sighting]:
         """Return at most `MAX_OBJECTS` sightings, those of highest confidence, in message order."""
         ranked = sorted(sightings, key=lambda sighting: -sighting.confidence)
-        detail = f"{MAX_OBJECTS} other detections have equal or higher scores"
-        for sighting in ranked[MAX_OBJECTS:]:
-            self.note(sighting.index, "too-many", detail)
+        if (more := len(ranked) - MAX_OBJECTS + self.left_out) > 0:
+            detail = f"{more} detections are left out: {MAX_OBJECTS} have equal or higher scores"
+            self.note(None, "too-many", detail)
         return sorted(ranked[:MAX_OBJECTS], key=lambda sighting: sighting.index)
 
     def objects(self) -> list[dict[str, Any]]:
@@ -314,8 +317,8 @@ class _Converter:
 
 
 def is_number(label: str) -> bool:
-    """Return whether a class is a whole number, which needs a label map."""
-    return label.removeprefix("-").isdecimal()
+    """Return whether a class is a whole number or an id of Freebase, which need a label map."""
+    return label.removeprefix("-").isdecimal() or label.startswith(("/m/", "/g/", "/t/"))
 
 
 def _named(names: str, values: Sequence[float] | None) -> dict[str, float]:

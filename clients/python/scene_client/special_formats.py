@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
@@ -17,6 +18,7 @@ from scene_client.paths import each
 from scene_client.ros_fields import items, members, numbers, take
 
 NO_TURN: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
+_SYMBOL: Final = re.compile(r"(\w?\(?\d+\)?)?")  # of a node, such as O(3)
 Records = list[dict[str, Any]]
 
 
@@ -25,11 +27,19 @@ def rows_of(path: str, data: Any) -> Records:
     records = []
     for chain in each(data, path):
         key, node = chain[-1]
-        lists = {name: value for name, value in members(node) if isinstance(value, list) and value}
+        pairs = [(name, _listed(value)) for name, value in members(node)]
+        lists = {name: value for name, value in pairs if value}
         scene = key + 1 if isinstance(key, int) else key
         rows = zip(*lists.values(), strict=True)
         records += [{"scene": scene, **dict(zip(lists, row, strict=True))} for row in rows]
     return records
+
+
+def _listed(value: Any) -> list[Any]:
+    """Return a list, or the values of an object; an empty list for other data."""
+    return (
+        value if isinstance(value, list) else [*value.values()] if isinstance(value, dict) else []
+    )
 
 
 # -------------------------------------------------------------------------------- scene graphs
@@ -58,7 +68,8 @@ def hydra(data: Any) -> Records:
     for key, node in nodes.items():
         thing = node["attributes"]
         if "Object" in str(thing.get("type")):
-            label = labels.get(thing["semantic_label"], thing["semantic_label"])
+            number, name = thing["semantic_label"], thing.get("name", "")
+            label = labels.get(number, number if _SYMBOL.fullmatch(name) else name)
             record = {
                 "label": label,
                 "id": thing.get("name", ""),
