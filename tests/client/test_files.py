@@ -249,3 +249,16 @@ def test_a_yaml_text_has_a_scene_for_each_document(tmp_path: Path) -> None:
     path.write_text(EXAMPLES["echo.yaml"].text * 2)
     assert len(scenes_of(path.read_bytes())) == 2
     assert rounded(dict(scene_client.from_file(f"{path}:2"))) == EXAMPLES["echo.yaml"].request
+
+
+def test_a_message_that_does_not_fit_its_schema_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "bag.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("a/msg/B", "ros2msg", b"string[] detections")
+        channel = writer.register_channel("/a", "cdr", schema)
+        writer.add_message(channel, 0, b"\0\1\0\0\xff\xff\xff\xff", 0)
+        writer.finish()
+    with pytest.raises(MessageError, match="without detections|does not fit"):
+        scene_client.from_file(path)

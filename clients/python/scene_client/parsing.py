@@ -7,6 +7,7 @@ import csv
 import io
 import json
 import re
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from copy import copy
@@ -22,7 +23,7 @@ from scene_client.ros_fields import MessageError
 
 _MOST_YAML: Final = 2**19  # bytes; PyYAML is slow
 MOST_MESSAGES: Final = 2**26
-"""Maximum size of a chunk of a recording after decompression in bytes."""
+"""Maximum size of the chunks of a recording after decompression in bytes."""
 
 _PART: Final = 2**16  # characters of XML
 _START: Final = 2000  # characters in which a refused format shows
@@ -389,11 +390,13 @@ def _messages(content: bytes) -> Parts:
     """Return the messages of a recording (MCAP) by topic and number: of ROS 2, or in JSON."""
     reader, kinds = extra("mcap.stream_reader"), extra("mcap.records")
     factory = extra("mcap_ros2.decoder").DecoderFactory()
-    schemas, channels, parts = {}, {}, Parts()
+    schemas, channels, parts, left = {}, {}, Parts(), MOST_MESSAGES
+    counts: Counter[str] = Counter()
     try:
         stream = reader.StreamReader(io.BytesIO(content), emit_chunks=True)
         for outer in stream.records:
-            chunk = _unpacked(outer) if isinstance(outer, kinds.Chunk) else None
+            chunk = _unpacked(outer, left) if isinstance(outer, kinds.Chunk) else None
+            left -= len(chunk.data) if chunk else 0
             for record in reader.breakup_chunk(chunk) if chunk else (outer,):
                 if isinstance(record, kinds.Schema):
                     schemas[record.id] = record
@@ -404,8 +407,9 @@ def _messages(content: bytes) -> Parts:
                     schema, coding = schemas.get(channel.schema_id), channel.message_encoding
                     decode = json.loads if coding == "json" else factory.decoder_for(coding, schema)
                     if decode is not None:
-                        count = sum(1 for name in parts if name.startswith(f"{channel.topic}:"))
-                        parts[f"{channel.topic}:{count + 1}"] = partial(decode, record.data)
+                        counts[channel.topic] += 1
+                        name = f"{channel.topic}:{counts[channel.topic]}"
+                        parts[name] = partial(_decoded, decode, record.data)
     except MessageError:
         raise
     except Exception:  # noqa: BLE001 — of any of three libraries
@@ -413,15 +417,22 @@ def _messages(content: bytes) -> Parts:
     return parts
 
 
-def _unpacked(chunk: Any) -> Any:
-    """Return a chunk of a recording with the data as they are, which have a limit."""
+def _decoded(decode: Callable[[bytes], Any], data: bytes) -> Any:
+    try:
+        return decode(data)
+    except Exception:  # noqa: BLE001 — of any of three libraries
+        raise MessageError("this message does not fit its schema") from None
+
+
+def _unpacked(chunk: Any, most: int) -> Any:
+    """Return a chunk of a recording with its data as they are, of at most so many bytes."""
     if chunk.compression == "zstd":
         stream = extra("zstandard").ZstdDecompressor().stream_reader(chunk.data)
-        data = stream.read(MOST_MESSAGES + 1)
+        data = stream.read(most + 1)
     elif chunk.compression == "lz4":
-        data = extra("lz4.frame").LZ4FrameDecompressor().decompress(chunk.data, MOST_MESSAGES + 1)
+        data = extra("lz4.frame").LZ4FrameDecompressor().decompress(chunk.data, most + 1)
     else:
         data = chunk.data
-    if len(data) > MOST_MESSAGES:
-        raise MessageError(f"this is a recording with a chunk of more than {MOST_MESSAGES} bytes")
+    if len(data) > most:
+        raise MessageError(f"this is a recording of more than {MOST_MESSAGES} bytes")
     return replace(chunk, data=data, compression="")

@@ -19,8 +19,10 @@ class ScenesRequest(Request):
     """the content of the file, if it is text"""
     base64: str | None = None
     """the bytes of the file in Base64 (RFC 4648), in place of `text`"""
-    name: Annotated[str, Field(min_length=1, max_length=255), AfterValidator(plain_text)]
-    """name of the file. In a file with the suffix `.jsonl`, each line is a scene"""
+    name: Annotated[str, Field(min_length=1, max_length=255), AfterValidator(plain_text)] | None = (
+        None
+    )
+    """name of the file. The content decides the format, so the name may be left out"""
     label_map: Annotated[str | None, Field(max_length=65536)] = None
     """labels of numeric class ids: `coco80`, `coco91`, or the content of a file with the labels"""
 
