@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from scene_client.formats import Reader, are_records, chosen, from_data, scenes_in
 from scene_client.home_state import FORMAT, state_of
-from scene_client.parsing import Parts, json_value, parsed, text_of, yaml_values
+from scene_client.parsing import Parts, data_of, json_value, parsed, text_of
 from scene_client.ros_fields import WELL_KNOWN, LabelMap, MessageError, read_label_map
 from scene_client.sightings import SceneFields
 
@@ -191,52 +191,9 @@ def labels_in(text: str) -> dict[str, str | None]:
         MessageError: the text does not contain labels.
     """
     try:
-        return read_label_map(text if text in WELL_KNOWN else _names(text.removeprefix("\ufeff")))
+        return read_label_map(text if text in WELL_KNOWN else _names_in(data_of(text)))
     except MessageError as error:
         raise MessageError(f"the label map does not contain labels: {error}") from None
-    except (LookupError, TypeError, ValueError, RecursionError):
-        raise MessageError("the label map does not contain labels") from None
-
-
-# An id and a label in a line, in this order or the other.
-_PAIR: Final = re.compile(r"(?P<id>\d+|/[mgt]/\w+)[\s:,;=]+(?P<label>\S.*)")
-_REVERSED: Final = re.compile(r"(?P<label>[^,;\t]+)[,;\t]+(?P<id>\d+)")
-
-
-def _names(text: str) -> Any:
-    if text.lstrip()[:1] in ("{", "["):
-        return _names_of(json_value(text))
-    if entries := re.findall(r"\bitem\s*\{([^{}]*)\}", text):  # of TensorFlow
-        return {
-            _member(entry, "id"): _member(entry, "display_name") or _member(entry, "name")
-            for entry in entries
-        }
-    lines = [line.strip() for line in text.splitlines() if not line.lstrip().startswith("#")]
-    lines = [*filter(None, lines)]
-    for form in (_PAIR, _REVERSED):
-        pairs = [form.fullmatch(line) for line in lines]
-        pairs = pairs[1:] if len(pairs) > 1 and pairs[0] is None else pairs  # after a header
-        if pairs and all(pairs):
-            return {pair["id"]: _without_comment(pair["label"]) for pair in pairs if pair}
-    if any(re.match(r"[\w/* -]+:(\s|$)|- |---", line) for line in lines):
-        found = [_names_of(value) for value in yaml_values(text)]
-        return next(filter(None, found), None)
-    return None if any("=" in line or "," in line for line in lines) else lines
-
-
-_MEMBERS: Final = {
-    name: re.compile(rf"\b{name}\s*:\s*(?:\"([^\"]*)\"|'([^']*)'|(\S+))")
-    for name in ("id", "name", "display_name")
-}
-
-
-def _member(entry: str, name: str) -> str:
-    found = _MEMBERS[name].search(entry)
-    return next(filter(None, found.groups()), "") if found else ""
-
-
-def _without_comment(label: str) -> str:
-    return label.partition(" #")[0].strip(" '\"")
 
 
 _NAMES: Final = (
@@ -245,37 +202,37 @@ _NAMES: Final = (
 )
 
 
-def _names_of(data: Any) -> Any:
+_IDS: Final = ("id", "class_id", "LabelName")
+_LABELS: Final = ("DisplayName", "name", "class_name", "label")
+
+
+def _first(entry: dict[str, Any], *names: str, default: Any = None) -> Any:
+    return next((entry[name] for name in names if name in entry), default)
+
+
+def _names_in(data: Any, depth: int = 6) -> Any:
     """Return the labels in data: a list, or a dictionary by class ids; None without labels."""
-    for value in (data, *_inner(data, 6)):
-        members = value if isinstance(value, dict) else {}
-        named = next((members[name] for name in _NAMES if name in members), None)
-        if (labels := _labels_of(named)) is not None:
-            return labels
-    return _labels_of(data)
-
-
-def _inner(value: Any, depth: int) -> Iterator[Any]:
-    for part in value.values() if isinstance(value, dict) and depth else ():
-        yield part
-        yield from _inner(part, depth - 1)
-
-
-def _labels_of(value: Any) -> Any:
-    if isinstance(value, dict) and value:
-        if all(isinstance(label, str) for label in value.values()):
-            return value
-        if all(type(number) is int for number in value.values()):  # from labels to ids
-            return {number: label for label, number in value.items()}
-        return None
-    if isinstance(value, list) and value and isinstance(value[0], dict):
-        if {"box", "bbox", "score", "confidence"} & value[0].keys():  # detections
+    if isinstance(data, list):
+        records = [one for one in data if isinstance(one, dict)]
+        if any({"box", "bbox", "score", "confidence"} & one.keys() for one in records):
+            return None  # detections
+        pairs = [
+            (_first(one, *_IDS, default=n), _first(one, *_LABELS)) for n, one in enumerate(records)
+        ]
+        if not all(label for _, label in pairs):
             return None
-        return {
-            one.get("id", one.get("class_id", n)): one.get("name", one.get("class_name"))
-            for n, one in enumerate(value)
-        }
-    return value if isinstance(value, list) and value else None
+        return dict(pairs) or data or None
+    if not isinstance(data, dict) or not depth:
+        return None
+    named = [name for name in _NAMES if name in data]
+    for name in named or data:
+        found = _names_in(data[name], depth - 1)
+        if found is not None and (named or isinstance(data[name], dict)):
+            return found
+    if named or not all(isinstance(value, str | int) for value in data.values()):
+        return None
+    has_ids = all(type(number) is int for number in data.values())  # from labels to ids
+    return {number: label for label, number in data.items()} if has_ids else data
 
 
 # -------------------------------------------------------------------------------------- contents

@@ -30,6 +30,12 @@ _START: Final = 2000  # characters in which a refused format shows
 _BEFORE: Final = r"(?is)\s*(?:<\?xml[^>]*>\s*)?(?:<!--(?:(?!-->).)*-->\s*)?(?:#\s[^\n]*\n\s*)*"
 _FENCE: Final = re.compile(r"```(?:\w+)?[ \t]*\n(.*?)```", re.DOTALL)
 _COMMENT: Final = re.compile(r"#(\s|$)")
+_ITEMS: Final = re.compile(r"\bitem\s*\{([^{}]*)\}")
+_MEMBERS: Final = {
+    name: re.compile(rf"\b{name}\s*:\s*(?:\"([^\"]*)\"|'([^']*)'|(\S+))")
+    for name in ("id", "name", "display_name")
+}
+_NUMBERED: Final = re.compile(r"(\d+|/[mgt]/\w+)([,;:=\t]| [,;:=]?)[ \t]*([^\d\s,;:=].*)")
 _ITEM: Final = re.compile(r"(?:[-*•+]|\d{1,3}[.)])[ \t]+(?=\S)")
 _YAML: Final = re.compile(r"---(\s|$)|- |[\w./ -]{1,64}:(\s|$)")
 _DEEPEST: Final = 64  # nesting of YAML and XML
@@ -45,7 +51,7 @@ def parsed(content: bytes) -> Any:
     _refuse(content[:_START].decode("latin-1").removeprefix("\u00ef\u00bb\u00bf"))
     if content.startswith(b"\x89MCAP"):
         return _messages(content)
-    return _data(text_of(content))
+    return data_of(text_of(content))
 
 
 class Parts(dict[str, Callable[[], Any]]):
@@ -82,9 +88,11 @@ def _refuse(start: str) -> None:
             raise MessageError(f"this is {form['name']}: {form['use']}")
 
 
-def _data(text: str) -> Any:
+def data_of(text: str) -> Any:
+    """Return the data of a text, as `parsed` does."""
+    text = text.removeprefix("\ufeff")
     if len(blocks := _FENCE.findall(text)) > 1:  # of a language model
-        return Parts({str(n): partial(_data, block) for n, block in enumerate(blocks, 1)})
+        return Parts({str(n): partial(data_of, block) for n, block in enumerate(blocks, 1)})
     text = blocks[0] if blocks else text
     start = text.lstrip()[:1]
     if start == "<":
@@ -95,12 +103,19 @@ def _data(text: str) -> Any:
     lines = [line for line in lines if not _COMMENT.match(line)]
     if not lines:
         raise MessageError("the file is empty")
+    if items := _ITEMS.findall(text):  # a label map of TensorFlow
+        return {_member(item, "id"): _member(item, "display_name", "name") for item in items}
     for parse in (_table, _numbers, _lines, _labels):
         if (data := parse(lines)) is not None:
             return data
     if _YAML.match(lines[0]) and (data := _yaml(text)) is not None:
         return data
     raise MessageError(_what_text(lines))
+
+
+def _member(item: str, *names: str) -> str:
+    found = (_MEMBERS[name].search(item) for name in names)
+    return next((part for one in found if one for part in one.groups() if part), "")
 
 
 def _json(text: str) -> Any:
@@ -251,10 +266,12 @@ def _labels(lines: list[str]) -> list[str] | dict[str, str] | None:
     else:
         labels = [label for line in lines for label in line.split(",")]
     labels = [label.strip() for label in labels if label.strip()]
-    numbered = [re.fullmatch(r"(\d+)[\s,;:=]+(\D.*)", line) for line in lines]
-    numbers = [int(one[1]) for one in numbered if one]
-    if len(numbers) == len(lines) and numbers in ([*range(n, n + len(lines))] for n in (0, 1)):
-        return {one[1]: one[2] for one in numbered if one}  # a label map
+    numbered = [found for line in lines if (found := _NUMBERED.fullmatch(line))]
+    counted = ([str(first + n) for n in range(len(lines))] for first in (0, 1))
+    # "2 chairs" can be a number of things.
+    is_map = all(one[2].strip() for one in numbered) or [one[1] for one in numbered] in counted
+    if is_map and len(numbered) == len(lines):
+        return {one[1]: one[3].partition(" #")[0].strip(" '\"") for one in numbered}
     if any(map(_is_no_label, labels)):
         return None
     return labels
