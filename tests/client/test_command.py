@@ -313,3 +313,12 @@ def test_bash_completes_commands_options_and_values(words: str, expected: str) -
     environment = os.environ | variables | {"_SCENE_COMPLETE": "complete_bash"}
     done = run_program(sys.executable, "-m", "scene_client", env=environment)
     assert done.stdout.split() == [expected]
+
+
+def test_a_label_with_the_name_of_a_file_is_a_label(
+    scene: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "lamp").write_text("bed, pillow\n")
+    assert "lamp" in scene("outliers", "bed", "lamp").stdout
+    assert "pillow" in scene("outliers", "lamp").stdout

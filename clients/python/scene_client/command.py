@@ -480,7 +480,8 @@ def _scene(
     if things is None:
         _fail("the objects are missing: give labels, a file that ends in .json, or - for stdin")
     things = [part for thing in things for part in _labels(thing)]
-    files = [thing for thing in things if is_file(thing)]
+    # Among other labels, a word such as "lamp" is a label, also if a file has this name.
+    files = [one for one in things if is_file(one) and (len(things) == 1 or not one.isalpha())]
     if files and things != files[:1]:
         _fail(f"{files[0]} is a whole scene: remove the labels and other files")
     try:
