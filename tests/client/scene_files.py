@@ -81,7 +81,7 @@ REFUSED: dict[str, tuple[str, str]] = {
     "comments.txt": ("# a\n" * 1000 + "?", "no known format"),
     "mesh.gltf": ('{"asset": {"version": "2.0"}, "nodes": [{"name": "Chair"}]}', "a mesh (glTF)"),
     "tracks.txt": ("1,1,40,120,260,290,0.91,-1,-1,-1\n", "MOTChallenge"),
-    "unknown.json": ('{"shapes": [{"label": "bed"}], "version": "5.0"}', "nearest is LabelMe"),
+    "unknown.json": ('{"shapes": [{"points": [[1, 2]]}], "version": "5"}', "nearest is LabelMe"),
     "other.json": ('{"rooms": {"a": 1}}', "fields rooms"),
     "value.json": ("3", "no known format"),
     "empty.json": ("", "the file is empty"),

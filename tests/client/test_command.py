@@ -211,7 +211,11 @@ FILES = {
         ("missing bed --offline nowhere", 2, ["directory"]),
         ("missing ./two.jsonl", 2, ["has 2 scenes (1, 2): choose one, such as ./two.jsonl:1"]),
         ("missing ./two.jsonl:3", 2, ["no scene 3; it has 2 scenes (1, 2)"]),
-        ("missing ./bare.jsonl:1", 2, ["this is a JSON object with the fields scene_id, and no known format"]),
+        (
+            "missing ./bare.jsonl:1",
+            2,
+            ["this is a JSON object with the fields scene_id, and no known format"],
+        ),
         ("where lamp", 2, ["the rooms are missing"]),
         ("where lamp nowhere.json", 2, ["nowhere.json: no such file"]),
         ("where lamp broken.json", 2, ["broken.json: this is not JSON"]),

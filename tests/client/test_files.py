@@ -260,5 +260,5 @@ def test_a_message_that_does_not_fit_its_schema_is_refused(tmp_path: Path) -> No
         channel = writer.register_channel("/a", "cdr", schema)
         writer.add_message(channel, 0, b"\0\1\0\0\xff\xff\xff\xff", 0)
         writer.finish()
-    with pytest.raises(MessageError, match="without detections|does not fit"):
+    with pytest.raises(MessageError, match=r"without detections|does not fit"):
         scene_client.from_file(path)

@@ -26,20 +26,22 @@ if TYPE_CHECKING:
     from scene_client.home_state import Event
     from scene_client.offline import OfflineClient
     from scene_client.recorder import Recorder
+    from scene_client.ros_fields import MessageError
     from scene_client.sync import Client
 
 __version__ = "2.0.0"
 
 __all__ = [
     "AnswerError", "AsyncClient", "Client", "ClientError", "DeadlineError", "Event", "Home",
-    "HomeFileError", "InvalidRequestError", "OfflineClient", "ProblemError", "Recorder", "Settings",
-    "UnreachableError", "from_data", "from_file", "rooms_from_file",
+    "HomeFileError", "InvalidRequestError", "MessageError", "OfflineClient", "ProblemError",
+    "Recorder", "Settings", "UnreachableError", "from_data", "from_file", "rooms_from_file",
 ]  # fmt: skip
 
 # Maps each name to the module that defines the name. The package imports the module on first use of
 # the name. So the service, which needs only the schemas, starts without httpx.
 _MODULES = {
     "AsyncClient": "asynchronous", "Client": "sync", "Event": "home_state", "Home": "home",
+    "MessageError": "ros_fields",
     "OfflineClient": "offline", "Recorder": "recorder", "Settings": "home_settings",
     "from_data": "formats", "from_file": "files", "rooms_from_file": "files",
 }  # fmt: skip

@@ -42,7 +42,7 @@ def numeric(value: Any, what: str) -> float:
 def numerics(value: Any, what: str) -> list[float]:
     """Return the numbers of a list, of nested lists, of "x,y;x,y", or of the members x, y, z, w."""
     if isinstance(value, str) and "," in value:
-        value = value.replace(";", ",").split(",")
+        value = value.strip("[]() ").replace(";", ",").split(",")
     if hasattr(value, "tolist"):  # an array of numpy or of the standard library
         value = value.tolist()
     if isinstance(value, list | tuple):

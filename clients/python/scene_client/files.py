@@ -191,7 +191,10 @@ def labels_in(text: str) -> dict[str, str | None]:
         MessageError: the text does not contain labels.
     """
     try:
-        return read_label_map(text if text in WELL_KNOWN else _names_in(data_of(text)))
+        names = text if text in WELL_KNOWN else _names_in(data_of(text))
+        if names is None:
+            raise MessageError("send one label a line, or ids and labels")
+        return read_label_map(names)
     except MessageError as error:
         raise MessageError(f"the label map does not contain labels: {error}") from None
 
@@ -203,14 +206,17 @@ _NAMES: Final = (
 
 
 _IDS: Final = ("id", "class_id", "LabelName")
-_LABELS: Final = ("DisplayName", "name", "class_name", "label")
+_LABELS: Final = ("DisplayName", "name", "class_name", "label", "raw_category", "category")
 
 
 def _first(entry: dict[str, Any], *names: str, default: Any = None) -> Any:
     return next((entry[name] for name in names if name in entry), default)
 
 
-def _names_in(data: Any, depth: int = 6) -> Any:
+_DEEPEST: Final = 6
+
+
+def _names_in(data: Any, depth: int = _DEEPEST) -> Any:
     """Return the labels in data: a list, or a dictionary by class ids; None without labels."""
     if isinstance(data, list):
         records = [one for one in data if isinstance(one, dict)]
@@ -229,10 +235,11 @@ def _names_in(data: Any, depth: int = 6) -> Any:
         found = _names_in(data[name], depth - 1)
         if found is not None and (named or isinstance(data[name], dict)):
             return found
-    if named or not all(isinstance(value, str | int) for value in data.values()):
-        return None
-    has_ids = all(type(number) is int for number in data.values())  # from labels to ids
-    return {number: label for label, number in data.items()} if has_ids else data
+    if not named and data and all(type(number) is int for number in data.values()):
+        return {number: label for label, number in data.items()}  # from labels to ids
+    has_ids = depth == _DEEPEST or all(str(key).isdecimal() for key in data)
+    is_flat = not named and all(isinstance(label, str) for label in data.values())
+    return data if has_ids and is_flat and data else None
 
 
 # -------------------------------------------------------------------------------------- contents

@@ -112,8 +112,8 @@ def chosen(scenes: Mapping[str, Reader], scene: object, file: str = "") -> Reade
         if str(scene) == "1":
             return scenes[""]
         raise MessageError(f"the file has one scene, and no scene {scene}")
-    names = ", ".join(short(name) for name in islice(scenes, 5)) + ", …" * (len(scenes) > 5)
-    first = short(next(iter(scenes), ""))
+    names = ", ".join(short(name)[:24] for name in islice(scenes, 5)) + ", …" * (len(scenes) > 5)
+    first = next((name for name in scenes if name and name == short(name)), "")
     how = f"{file}:{first}" if file else f"scene={first!r}"
     problem = "" if scene is None else f"no scene {scene}; it has "
     raise MessageError(
@@ -141,6 +141,7 @@ def _is_label_map(data: Any) -> bool:
 
 
 _DEEPEST: Final = 3  # lists and objects around records
+_OWN_NAME: Final = ["^.frame_id|^.frame|^.frame_number|^.image|^.file_name|^.filename", "^.@"]
 
 
 def _form_of_records(data: Any) -> Form | None:
@@ -152,7 +153,7 @@ def _form_of_records(data: Any) -> Form | None:
         return None
     (path,) = paths
     is_several = path.count("[]") + path.count("*") > 1
-    return RECORDS | {"items": path} | ({"scene": "^.@"} if is_several else {})
+    return RECORDS | {"items": path} | ({"scene": _OWN_NAME} if is_several else {})
 
 
 def _paths_of_records(data: Any, depth: int, name: str = "") -> set[str]:
@@ -175,6 +176,8 @@ def are_records(data: Any, name: str = "") -> bool:
     """
     if not isinstance(data, list) or not data or not all(isinstance(one, dict) for one in data):
         return False
+    if name not in ("", "objects") and "label" in data[0]:
+        return True
     first = Record(((None, data), (0, data[0])))
     if first.first("label") is None or data[0].keys() <= _REQUESTED:
         return False
@@ -224,6 +227,9 @@ def _request(data: Any) -> dict[str, Any]:
     if not isinstance(data, dict) or not isinstance(data.get("objects"), list):
         raise MessageError(f"this is {_kind(data)}, and no known format{_nearest(data)}")
     things = [thing for thing in data["objects"] if isinstance(thing, dict)]
+    if things and not any("label" in thing for thing in things):
+        kind = _kind(things)
+        raise MessageError(f"this is {kind} and no label, and no known format{_nearest(data)}")
     is_training = _TRAINING & data.keys() or any(
         type(thing.get("id")) is int or _TRAINING_OBJECT & thing.keys() for thing in things
     )
@@ -244,7 +250,7 @@ def _kind(data: Any) -> str:
     one, kind = (data[0], "list of objects") if is_list and data else (data, "object")
     if not isinstance(one, dict):
         return "a JSON list" if is_list else "a JSON value"
-    names = ", ".join(short(str(name)) for name in islice(one, 5))
+    names = ", ".join(short(str(name))[:24] for name in islice(one, 5))
     kind = "YAML" if isinstance(data, Yaml) else f"a JSON {kind}"
     return f"{kind} with the fields {names}" if names else f"{kind} without fields"
 
@@ -252,6 +258,8 @@ def _kind(data: Any) -> str:
 def _signs(form: Form, data: Any) -> float:
     """Return which part of the paths in `has` leads to a value."""
     paths = form.get("has", ())
+    if not paths or (paths[0].startswith("[]") and not isinstance(data, list)):
+        return 0.0
     return sum(leads(path, data) for path in paths) / max(len(paths), 1)
 
 

@@ -37,7 +37,7 @@ _MEMBERS: Final = {
 }
 _NUMBERED: Final = re.compile(r"(\d+|/[mgt]/\w+)([,;:=\t]| [,;:=]?)[ \t]*([^\d\s,;:=].*)")
 _ITEM: Final = re.compile(r"(?:[-*•+]|\d{1,3}[.)])[ \t]+(?=\S)")
-_YAML: Final = re.compile(r"---(\s|$)|- |[\w./ -]{1,64}:(\s|$)")
+_YAML: Final = re.compile(r"---(\s|$)|- |[\w./* -]{1,64}:(\s|$)")
 _DEEPEST: Final = 64  # nesting of YAML and XML
 _LONGEST: Final = 5  # words of a label; more of them are a sentence
 
@@ -78,7 +78,7 @@ def text_of(content: bytes) -> str:
     except UnicodeDecodeError:
         text = "\0"
     if "\0" in text:
-        raise MessageError("this is no text in UTF-8, and no other known format")
+        raise MessageError("this is no text in UTF-8, and no other known format: save it as UTF-8")
     return text
 
 
@@ -100,7 +100,8 @@ def data_of(text: str) -> Any:
     if start in ("{", "["):
         return _json(text)
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    lines = [line for line in lines if not _COMMENT.match(line)]
+    lines = [one for one in lines if not _COMMENT.match(one) and one != "???"]
+    lines = lines[1:] if lines and lines[0].startswith("sep=") else lines  # of Excel
     if not lines:
         raise MessageError("the file is empty")
     if items := _ITEMS.findall(text):  # a label map of TensorFlow
@@ -244,6 +245,7 @@ def _lines(lines: list[str]) -> Rows | None:
 
 def _row(words: list[str], names: list[str], form: Form) -> dict[str, str] | None:
     """Return the fields of a line: a label, which may have several words, and numbers."""
+    words = words[:-1] if words[-1] == "difficult" else words
     count = next((n for n, word in enumerate(words) if _is_number(word)), len(words))
     numbers = words[count:]
     if not count or not form["least"] <= 1 + len(numbers) <= len(names):
@@ -256,7 +258,7 @@ def _row(words: list[str], names: list[str], form: Form) -> dict[str, str] | Non
 def _labels(lines: list[str]) -> list[str] | dict[str, str] | None:
     """Return the labels of a list or a caption: one a line, or with separators between them."""
     if len(lines) == 1:
-        separators = (" | ", " . ", ",")
+        separators = (" | ", " . ", ",", ";")
         separator = max(separators, key=lines[0].count)
         if lines[0].endswith(".") and separator == ",":  # a sentence
             return None
@@ -281,7 +283,7 @@ def _is_no_label(label: str) -> bool:
     """Return whether a text is a sentence, or has marks of data or a number as a word."""
     words = label.split()
     has_number = any(_is_number(word.strip("()%,;")) for word in words)
-    has_marks = re.search(r'[{}\[\]":<=#!?]|\*\*|\.\s', label) is not None
+    has_marks = re.search(r'[{}\[\]":;<=#!?]|\*\*|\.\s', label) is not None
     return has_number or has_marks or len(words) > _LONGEST or label in ("null", "true", "false")
 
 

@@ -48,6 +48,19 @@ def relation(text: str) -> dict[str, str]:
     raise _error(f"{rule}; {_names_for(words[1:-1])}")
 
 
+# Words for places without a relation of the service, and things that carry whole rooms.
+_OTHER_PLACES: Final = ("beside", "next to", "near", "by", "close to", "against", "between", "at")
+_STRUCTURE: Final = ("floor", "ground", "wall", "ceiling")
+
+
+def is_unused(text: str) -> bool:
+    """Return whether a text states a place without use for the service, as "on the floor"."""
+    words = text.split()
+    return words[-1:] in [[name] for name in _STRUCTURE] or any(
+        f" {other} " in " ".join(words) for other in _OTHER_PLACES
+    )
+
+
 def place(text: str) -> dict[str, str]:
     """Return the relation and the object of a text such as "on-top desk"."""
     words = text.split()

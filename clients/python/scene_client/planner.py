@@ -18,7 +18,7 @@ from scene_client.calls import validated
 from scene_client.errors import ClientError, InvalidRequestError
 from scene_client.schemas import Relation, Request
 from scene_client.schemas.missing import Anchor
-from scene_client.schemas.requests import Label, SceneObject, SomeObjects
+from scene_client.schemas.requests import Detection, Label, SceneObject, SomeObjects
 from scene_client.schemas.where import Searched
 from scene_client.sync import Client
 
@@ -59,13 +59,23 @@ _OBJECTS: Final = {
 _HOME: Final = {"type": "object", "additionalProperties": _TEXTS}
 
 
+def _as_relation(value: Any) -> Any:
+    """Return the fields of a relation; a text of a place that the service does not use stays."""
+    is_used = isinstance(value, str) and not phrases.is_unused(value)
+    return phrases.relation(value) if is_used else value
+
+
 def _spoken(read: Callable[[str], dict[str, Any]]) -> BeforeValidator:
     return BeforeValidator(lambda value: read(value) if isinstance(value, str) else value)
 
 
 Objects = Annotated[SomeObjects, WithJsonSchema(_OBJECTS)]
 Labels = Annotated[list[Label], WithJsonSchema(_TEXTS)]
-Relations = Annotated[list[Annotated[Relation, _spoken(phrases.relation)]], WithJsonSchema(_TEXTS)]
+Stated = Annotated[
+    Relation | Label,
+    BeforeValidator(_as_relation),
+]
+Relations = Annotated[list[Stated], WithJsonSchema(_TEXTS)]
 Place = Annotated[Anchor, _spoken(phrases.place), WithJsonSchema({"type": "string"})]
 Home = Annotated[
     dict[str, list[SceneObject]], Field(min_length=1, max_length=32), WithJsonSchema(_HOME)
@@ -118,9 +128,30 @@ class _SceneTool(Tool):
     objects: Objects
     """the objects of one room, in plain words; with positions only if they are measured"""
     relations: Relations | None = None
-    """known relations, such as "lamp on desk" or "shoes under bed", as texts"""
+    """known relations of these objects, such as "lamp on desk", as texts; unused with positions"""
     room_type: Label | None = None
     """kind of the room, only if it is certain"""
+
+    def fields(self) -> dict[str, Any]:
+        """Return the arguments as fields of a request, without the relations of `unused`."""
+        fields = super().fields()
+        fields.pop("relations", None)
+        if used := [one for one in self.relations or () if self._is_used(one)]:
+            fields["relations"] = used
+        return fields
+
+    def unused(self) -> list[str]:
+        """Return the stated relations that the request does not have, in words."""
+        return [
+            one if isinstance(one, str) else f"{one.subject} {one.relation} {one.object}"
+            for one in self.relations or ()
+            if not self._is_used(one)
+        ]
+
+    def _is_used(self, stated: Relation | str) -> bool:
+        # The service derives relations from positions only if none are stated.
+        placed = any(isinstance(one, Detection) and one.position for one in self.objects)
+        return isinstance(stated, Relation) and not placed
 
 
 class FindOutOfPlace(_SceneTool):
@@ -132,7 +163,7 @@ class FindOutOfPlace(_SceneTool):
     def answer(self, client: Client) -> str:
         """Return the objects that do not belong, and those in wrong places."""
         found = client.outliers(**self.fields())
-        return sentences.text(found, sentences.out_of_place(found))
+        return sentences.text(found, sentences.out_of_place(found), unused=self.unused())
 
 
 class SuggestMissing(_SceneTool):
@@ -152,7 +183,8 @@ class SuggestMissing(_SceneTool):
         if "only" in fields:
             fields["candidates"] = fields.pop("only")
         found = client.missing(**fields, top_k=8)
-        return sentences.text(found, sentences.missing(found, only=self.only is not None))
+        said = sentences.missing(found, only=self.only is not None)
+        return sentences.text(found, said, unused=self.unused())
 
 
 class LocateObject(Tool):
@@ -199,7 +231,7 @@ class IdentifyRoom(Tool):
 
 
 class RelateObjects(_SceneTool):
-    """Tell how the objects of a room probably stand to each other: what is on, in, under or beside
+    """Tell how the objects of a room probably stand to each other: what is on, in, under or left of
     what. Use it for "where in the room is the book?" and to check relations."""
 
     name: ClassVar[str] = "relate_objects"
@@ -207,7 +239,7 @@ class RelateObjects(_SceneTool):
     def answer(self, client: Client) -> str:
         """Return the likely relations, and those that are unusual."""
         found = client.relations(**self.fields(), top_k=256, min_probability=sentences.MENTIONED)
-        return sentences.text(found, sentences.relations(found))
+        return sentences.text(found, sentences.relations(found), unused=self.unused())
 
 
 class ImagineRoom(Tool):
@@ -219,16 +251,19 @@ class ImagineRoom(Tool):
     room_type: Label | None = None
     """kind of the room in plain words: "kitchen", "dental office" and so on"""
     objects: Labels | None = None
-    """objects that the room must have"""
+    """objects that the room must have, if its kind is unknown"""
 
     def answer(self, client: Client) -> str:
         """Return the commonest objects and relations of sampled rooms."""
         if self.room_type is None and not self.objects:
-            raise InvalidRequestError.about("give `room_type`, `objects` or both")
+            raise InvalidRequestError.about("give `room_type`, or else `objects`")
+        # An object that is rare in such rooms would change what is usual there.
+        unused = self.objects or [] if self.room_type else []
+        fields = {"objects": [], **self.fields()} | ({"objects": []} if unused else {})
         # The same arguments give the same answer, so a planner can rely on it.
-        fields = {"objects": [], **self.fields()}
         found = client.generate(**fields, count=_SAMPLES, seed=0)
-        return sentences.text(found, sentences.imagined(found))
+        given = {*(self.objects or ()), *filter(None, [self.room_type])}
+        return sentences.text(found, sentences.imagined(found, given), unused=unused)
 
 
 TOOLS: Final[dict[str, type[Tool]]] = {

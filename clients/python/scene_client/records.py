@@ -120,6 +120,8 @@ class Record:
                 if factor is not None and _is_plain(value):
                     value = factor * numeric(value, name)
                 fields.setdefault(key, (owner + name, value))
+                if "." in name:  # of a flattened table, as in box.x1
+                    fields.setdefault(key_of(name.rpartition(".")[2]), (name, value))
                 if key in FIELDS["inside"] and depth < 3 and not isinstance(value, list | str):
                     nodes.append((f"{owner}{name}.", value, depth + 1))
         return fields
@@ -142,13 +144,14 @@ class Record:
 
     def unread(self) -> Iterator[str]:
         """Yield the names of the fields that carry a box, a score, a frame or a time, unread."""
+        outer = {name for name, _ in members(self.node)}
         for key, (name, value) in self.fields.items():
             is_empty = value is None or value == "" or value == [] or value == {}
             is_used = any(one == name or one.startswith(f"{name}.") for one in self.used)
             axes = ({key[:-1] + axis for axis in "xyz"}, {axis + key[1:] for axis in "xyz"})
             is_axis = any(key in names and names <= self.fields.keys() for names in axes)
             carries = is_axis or key in FIELDS["carrying"] or any(map(key.__contains__, _CARRIES))
-            if carries and not (is_empty or is_used or "." in name):
+            if carries and not (is_empty or is_used or name not in outer):
                 yield name
 
 
@@ -184,7 +187,7 @@ def _scene_names(form: Form, records: list[Record]) -> list[str]:
     """Return the name of the scene of each record: its image, its frame, its room or its time."""
     if "scene" in form:
         found = [spot(one.chain, form["scene"]) for one in records]
-        if str(form["scene"]).endswith("@"):
+        if form["scene"] == "^.@":
             return [str(key + 1 if isinstance(key, int) else key) for key in found]
         return ["" if name is None else str(name) for name in found]
     if _is_named(form):
@@ -273,7 +276,9 @@ class _Reader:
         stamp = next(filter(None, (self.stamp(one) for one in chosen[:1])), stamp)
         self.note_unread(chosen)
         is_list = form["name"] == RECORDS["name"] and not isinstance(self.data, Rows)
-        if is_list and not any(one.solid or one.image for one in sightings) and not self.notes:
+        is_bare = all(_is_plain(value) for one in chosen[:1] for _, value in one.fields.values())
+        has_boxes = any(one.solid or one.image for one in sightings)
+        if is_list and is_bare and not (has_boxes or self.notes):
             self.note("no-box", "there are no boxes: the results of a classifier are no objects")
         is_solid = form.get("is_solid")
         return Seen(sightings, frame, stamp, self.viewer(), is_solid, self.notes, left_out)
@@ -306,9 +311,10 @@ class _Reader:
         for n, one in enumerate(records, 1):
             score = one.first("score") if spec is None else spot(one.chain, spec)
             if isinstance(score, str):
-                is_percent |= score.strip().endswith("%")
-                score = numeric(score.strip(" %"), f"object {n}, the score")
-            scores.append(1.0 if score is None and "is_solid" not in self.form else score)
+                factor = 0.01 if score.strip().endswith("%") else 1.0
+                score = factor * numeric(score.strip(" %"), f"object {n}, the score")
+            is_unset = "is_solid" not in self.form and number(score) is None
+            scores.append(1.0 if is_unset else score)
         finite = [value for one in scores if (value := number(one)) is not None]
         above = [score for score in finite if score > 1.5]
         is_alone = len(above) == 1 and any(0 < score < 1 for score in finite)
@@ -347,9 +353,10 @@ class _Reader:
         return None, image(kind, value, what, theta) if kind else None
 
     def set_box(self, values: Mapping[str, Any], what: str) -> Solid | None:
-        """Return a box with a position. In messages, a box of zeros is unset."""
+        """Return a box with a position. In some formats, one of zeros or without size is unset."""
         box = solid(self.form, values, what) if values else None
-        return None if box and self.form.get("zero") == "unset" and box.is_unset else box
+        unset = {"unset": box and box.is_unset, "size": box and box.sides is None}
+        return None if unset.get(self.form.get("zero", "")) else box
 
     def found(self, record: Record, what: str) -> tuple[Solid | None, Box | None]:
         """Return the box of a record whose fields have usual names."""
@@ -360,7 +367,8 @@ class _Reader:
         is_flat = {"w", "h"} <= record.fields.keys() and not {"d", "l"} & record.fields.keys()
         for names in FIELDS["position"]:
             if (value := None if is_flat and names == "x,y,z" else record.take(names)) is not None:
-                if len(numerics(value, f"{what}, {names}")) == 3:
+                is_text = isinstance(value, str) and "," not in value  # such as "kitchen"
+                if not is_text and len(numerics(value, f"{what}, {names}")) == 3:
                     values = {"position": value}
                     for kind in ("size", "turn", "yaw"):
                         values[kind] = record.first(kind)

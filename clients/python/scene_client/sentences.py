@@ -43,15 +43,31 @@ Fact: TypeAlias = tuple[str, float, str]
 """A name, its probability and a further note, which may be empty."""
 
 
-def text(answer: Answer, sentences: Iterable[str], rooms: Collection[str] = ()) -> str:
+def text(
+    answer: Answer,
+    sentences: Iterable[str],
+    rooms: Collection[str] = (),
+    unused: Collection[str] = (),
+) -> str:
     """Return an answer as text: first the omitted and guessed words, then the warnings.
 
     Args:
         answer: the answer.
         sentences: sentences about the answer.
         rooms: names of rooms in the request, whose objects count if the name is unknown.
+        unused: relations, or objects of an imagined room, that the request does not have.
     """
-    return " ".join([*_words(answer, rooms), *_warnings(answer), *sentences])
+    words = [*_words(answer, rooms)]
+    if unused:
+        rule = "measured positions replace relations, which are between listed objects"
+        if isinstance(answer, GenerateAnswer):
+            rule = "the kind of the room decides"
+        words.append(f"I left out {', '.join(map(_quoted, unused))} ({rule}).")
+    return " ".join([*words, *_warnings(answer), *sentences])
+
+
+def _quoted(name: str) -> str:
+    return f'"{name}"'
 
 
 def _words(answer: Answer, rooms: Collection[str]) -> Iterator[str]:
@@ -73,12 +89,14 @@ def _words(answer: Answer, rooms: Collection[str]) -> Iterator[str]:
 
 def _warnings(answer: Answer) -> Iterator[str]:
     for warning in answer.warnings:
+        if warning.code == "not-judged" and isinstance(answer, OutliersAnswer):
+            continue  # `out_of_place` says it
         if warning.rooms:
             parts = "; ".join(f"{one.room_type}: {', '.join(one.objects)}" for one in warning.rooms)
             yield f"These are probably objects of several rooms ({parts}): ask about each room."
         else:
-            lead = "Not judged" if warning.code == "not-judged" else "Note"
-            yield f"{': '.join(filter(None, (lead, ', '.join(warning.objects), warning.message)))}."
+            names = f"{', '.join(warning.objects)}: " if warning.objects else ""
+            yield f"Note: {names}{warning.message}."
 
 
 def out_of_place(answer: OutliersAnswer) -> Iterator[str]:
@@ -88,14 +106,15 @@ def out_of_place(answer: OutliersAnswer) -> Iterator[str]:
     groups: dict[str, list[Fact]] = {name: [] for name in ("odd", "unreal", "doubtful", "fitting")}
     unknown = []
     for one in answer.outliers:
-        if one.log_odds is None or guessed & {one.label, one.listed_as}:
+        is_weak = guessed & {one.label, one.listed_as} or one.object in warned
+        if one.log_odds is None or (is_weak and not one.is_outlier):
             unknown.append(one.object)
         elif one.is_outlier:
             usual = f"usually with {', '.join(one.usually_with)}" if one.usually_with else ""
             groups["odd"].append((one.object, one.probability, usual))
         elif one.reason == "misdetection":
             groups["unreal"].append((one.object, 1 - (one.real or 0), ""))
-        elif one.object not in warned:
+        else:
             group = "doubtful" if one.probability >= _DOUBTFUL else "fitting"
             groups[group].append((one.object, one.probability, ""))
     places = [(one.is_misplaced, (_wrong(one), one.probability, "")) for one in answer.misplaced]
@@ -108,9 +127,11 @@ def out_of_place(answer: OutliersAnswer) -> Iterator[str]:
     if unknown:
         yield f"Not judged, as it may be anywhere or I know it too little: {', '.join(unknown)}."
     if fitting := groups["fitting"]:
-        is_all = len(fitting) == len(answer.outliers) and not moved
+        is_all = len(fitting) + len(unknown) == len(answer.outliers) and not moved
+        some = " judged" if unknown or answer.ignored else ""
         most = max(0.01, *(probability for _, probability, _ in fitting))
-        yield f"{'All objects fit' if is_all else 'All else fits'} (each at most {most:.2f})."
+        lead = f"All{some} objects fit" if is_all else "All else fits"
+        yield f"{lead} (each at most {most:.2f})."
 
 
 def _wrong(entry: MisplacedRelation) -> str:
@@ -129,7 +150,8 @@ def missing(answer: MissingAnswer, *, only: bool) -> Iterator[str]:
         only: whether the request names the candidates.
     """
     entries = [(one.listed_as or one.label, one.probability, _place(one)) for one in answer.missing]
-    unsure = "None of these is probable." if only else "I am sure of no further object."
+    doubt = "None of these is likelier than not; a low number is no proof of absence."
+    unsure = doubt if only else "I am sure of no further object."
     yield from _split(entries, "Probably also there", unsure)
     if answer.more:
         counts = (f"{one.label} (about {one.expected_count:.0f})" for one in answer.more[:MOST])
@@ -159,7 +181,14 @@ def where(answer: WhereAnswer) -> Iterator[str]:
         rooms.append((room.room, room.probability, ", ".join(places)))
     entries = [room for room in rooms if room[1] >= MENTIONED]
     yield from _split(entries, f"Probable place of {thing}", f"I am not sure about {thing}.")
+    best = max((one for one in answer.places if one.object), key=_likelihood, default=None)
+    if best is not None and entries and best.room != entries[0][0]:
+        yield f"Best single place: {_spot(best)} in {best.room} ({_number(best.probability)})."
     yield f"In none of these rooms: {_number(answer.not_here)}."
+
+
+def _likelihood(spot: Spot) -> float:
+    return spot.probability
 
 
 def _spot(spot: Spot) -> str:
@@ -179,7 +208,7 @@ def rooms(answer: RoomsAnswer, objects: Collection[str]) -> Iterator[str]:
         yield from _split(entries, "This is probably", "I am not sure which room this is.")
     else:
         (thing,) = objects
-        yield from _split(entries, f"{thing} is usually in", f"{thing} may be in many rooms.")
+        yield from _split(entries, f"Usual rooms of {thing}", f"{thing} may be in many rooms.")
     if not any(one.because for one in answer.room_types):
         yield "No object points clearly to one of these rooms."
 
@@ -188,15 +217,19 @@ def relations(answer: RelationsAnswer) -> Iterator[str]:
     """Say how the objects stand to each other, and which known relation is unusual."""
     known = [one for one in answer.relations if one.observed]
     if known:
-        yield f"Known: {', '.join(map(_relation, known[:MOST]))}."
-    odd = [(_relation(one), one.expected, "") for one in known if one.expected is not None]
-    yield from _facts("Known, but unusual", [one for one in odd if one[1] < MENTIONED])
+        said = (
+            f"{_relation(one)} (unusual: {_number(one.expected)})"
+            if one.expected is not None and one.expected < MENTIONED
+            else _relation(one)
+            for one in known[:MOST]
+        )
+        yield f"Known: {', '.join(said)}."
     others = [(_relation(one), one.probability, "") for one in answer.relations if not one.observed]
     yield from _split(others, "Likely", f"I am sure of no {'other ' * bool(known)}relation.")
 
 
-def imagined(answer: GenerateAnswer) -> Iterator[str]:
-    """Say how often sampled rooms have which objects and places."""
+def imagined(answer: GenerateAnswer, given: Collection[str]) -> Iterator[str]:
+    """Say how often sampled rooms have which objects and places, beside the given ones."""
     words, total = answer.listed_as or {}, len(answer.scenes)
     kinds = Counter(one.room_type or "unknown" for one in answer.scenes)
     things = Counter(words.get(name, name) for one in answer.scenes for name in one.objects)
@@ -210,7 +243,7 @@ def imagined(answer: GenerateAnswer) -> Iterator[str]:
     yield f"I imagined {total} rooms, and give the share of them."
     yield from _facts("Kind of room", [(name, n / total, "") for name, n in kinds.most_common(3)])
     yield from _split(
-        [(name, n / total, "") for name, n in things.most_common(2 * MOST)],
+        [(name, n / total, "") for name, n in things.most_common(2 * MOST) if name not in given],
         *("Usual objects", "No object is in most of them."),
     )
     common = [(" ".join(names), n / total, "") for names, n in places.most_common(MOST)]
