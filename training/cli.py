@@ -37,7 +37,7 @@ from training.runs.config_files import data_folder, load_config, with_settings
 from training.runs.example_scenes import accepted_examples, read_examples
 from training.runs.folder import FinishedRun, RunError, load_run, save_run
 from training.runs.pipeline import SplitScenes, prepare
-from training.runs.publish import RefusedError, publish_run, refit
+from training.runs.publish import RefusedError, publish_run, refit, rename
 from training.seed.command import seed as seed_command
 
 app = typer.Typer(
@@ -154,6 +154,9 @@ def publish(
     even_if_worse: Annotated[
         bool, typer.Option("--even-if-worse", "--force", help="publish even a refused version")
     ] = False,
+    names: Annotated[
+        bool, typer.Option("--names", help="with name@version: renew the names of classes only")
+    ] = False,
 ) -> None:
     """Calibrate, evaluate and publish a finished run, or refit the statistics of a version.
 
@@ -161,7 +164,8 @@ def publish(
     the limits of generated scenes again. The new version keeps the weights and the other
     calibration and metrics of the old version. For a version of `train --final`, the shares of
     flagged intruders, of alarms and of refused rooms are left out, because its weights know the
-    test scenes.
+    test scenes. With --names, the new version has today's names of its classes, and all else of the
+    old version.
 
     The command asks the model about untouched validation scenes, and refuses a model that certainly
     raises more alarms than its sensitivities promise. A refused version is not published, and the
@@ -180,8 +184,10 @@ def publish(
         if "@" in folder and not Path(folder).is_dir():
             if promote:
                 raise ConfigError(f"--promote compares training runs; {_ALIAS}")
-            _refit(folder, data or DATA, store, version)
+            _publish_again(folder, data or DATA, store, version, names=names)
             return
+        if names:
+            raise ConfigError("--names renews a published version: give NAME@VERSION")
         run = load_run(Path(folder))
         models = Store(store)
         models.require_new(run.config.name, version)
@@ -234,14 +240,17 @@ def _exit_refused(error: RefusedError, remedy: str = "") -> NoReturn:
     raise typer.Exit(3) from None
 
 
-def _refit(reference: str, root: Path, store: str, version: str) -> None:
-    """Publish a version of a stored model with statistics from the scenes in the folder `root`."""
+def _publish_again(reference: str, root: Path, store: str, version: str, *, names: bool) -> None:
+    """Publish a stored model with new names, or with statistics from the scenes in `root`."""
     models = Store(store)
     name, old = models.resolve(reference)
     models.require_new(name, version)
     artifact = models.load(name, old)
     with console.status("publishing") as status:
-        artifact = refit(artifact, root, models, version, progress=status.update)
+        if names:
+            artifact = rename(artifact, models, version)
+        else:
+            artifact = refit(artifact, root, models, version, progress=status.update)
     _print_published(artifact, store)
 
 

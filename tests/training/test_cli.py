@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.registry import Store
+from app.registry import Description, Store, VocabularyEntry
 from app.registry.references import AliasTarget
+from app.scene import Vocabulary
 from tests.conftest import REPOSITORY, run_program
 from tests.questions.answers import generate, missing, outliers, relations
 from tests.registry.small_artifacts import description, state
@@ -21,7 +22,7 @@ from training.fit.offset_statistics import fit_offsets
 from training.runs.config_files import load_config, with_settings
 from training.runs.folder import RunError
 from training.runs.pipeline import prepare
-from training.runs.publish import refit
+from training.runs.publish import publish_rounded, refit
 
 SIZES = {"machine.units": 4, "machine.states": 4, "machine.K": 4}
 CONFIG = with_settings(
@@ -63,6 +64,27 @@ def check_refit(artifact, store) -> None:
     changed = replace(artifact, manifest=before.model_copy(update={"data": other}))
     with pytest.raises(RunError, match="the scenes of rooms have changed"):
         refit(changed, Path(), Store(store), "1.0.2")
+
+
+def test_publish_renews_the_names_of_classes(tmp_path):
+    shipped = Store(REPOSITORY / "model_store")
+    old = shipped.load(*shipped.resolve("places-rbm"))
+    version = old.manifest.version
+    vocabulary = old.manifest.vocabulary.vocabulary()
+    loo = next(entry for entry in vocabulary.objects if "loo" in entry.aliases)
+    fewer = [replace(entry, aliases=("bog",) * (entry == loo)) for entry in vocabulary.objects]
+    entry = VocabularyEntry.of(
+        Vocabulary(fewer, vocabulary.room_types), old.model.spec.A, old.manifest.vocabulary.profiles
+    )
+    fields = {name: getattr(old.manifest, name) for name in Description.model_fields}
+    publish_rounded(Store(tmp_path), Description(**fields | {"vocabulary": entry}), old.model)
+    done = invoke("publish", f"places-rbm@{version}", "99.0.0", "--names", "--store", tmp_path)
+    assert "published places-rbm@99.0.0" in done
+    new = Store(tmp_path).load("places-rbm", "99.0.0")
+    assert new.model.vocabulary.objects == old.model.vocabulary.objects
+    assert new.manifest.metrics == old.manifest.metrics
+    check_equal(old.model.weights.arrays, new.model.weights.arrays)
+    invoke("publish", tmp_path, "1.0.0", "--names", "--store", tmp_path, code=1)
 
 
 @pytest.mark.slow

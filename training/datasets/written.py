@@ -60,6 +60,22 @@ def written_vocabulary() -> Vocabulary:
     return with_room_aliases(Vocabulary(objects, sorted(rooms.union(indoor.room_types))))
 
 
+def with_present_names(vocabulary: Vocabulary) -> Vocabulary:
+    """Return the vocabulary with the names that its classes have in the written vocabulary today.
+
+    The other classes keep their names. A name of two classes stays with the first.
+    """
+    present = {label_key(entry.label): entry.aliases for entry in written_vocabulary().objects}
+    taken = set(map(label_key, vocabulary.labels))
+    objects = []
+    for entry in vocabulary.objects:
+        names = present.get(label_key(entry.label), entry.aliases)
+        aliases = {key: name for name in names if (key := label_key(name)) not in taken}
+        taken.update(aliases)
+        objects.append(replace(entry, aliases=tuple(aliases.values())))
+    return with_room_aliases(Vocabulary(objects, vocabulary.room_types))
+
+
 def with_things(vocabulary: Vocabulary, things: Mapping[str, Thing]) -> Vocabulary:
     """Return the vocabulary with described sizes, parents and names. Its own entries stay."""
     described = {label_key(thing.label): thing for thing in things.values()}

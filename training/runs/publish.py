@@ -14,6 +14,7 @@ from app.registry import Artifact, DataSource, Description, Metric, Store, Vocab
 from training.datasets.batches import TrainingData
 from training.datasets.sources import SOURCES, is_inventory
 from training.datasets.vocabulary import with_aliases, with_room_aliases
+from training.datasets.written import with_present_names
 from training.evaluation.everyday_task import EVERYDAY
 from training.evaluation.outlier_tasks import untouched_alarms
 from training.evaluation.report import Progress, evaluate, silent
@@ -164,6 +165,23 @@ def refit(
     fields |= {"metrics": (*kept, *rows), "vocabulary": vocabulary}
     description = Description(**fields | {"calibration": refitted_model.calibration})
     return publish_rounded(store, description, refitted_model)
+
+
+def rename(artifact: Artifact, store: Store, version: str) -> Artifact:
+    """Publish a version of a model again with today's names of its classes and room types.
+
+    Weights, statistics and metrics stay. Scenes with the new names had no part in them.
+
+    Raises:
+        StoreError, ArtifactError: see `Store.publish`.
+    """
+    manifest, model = artifact.manifest, artifact.model
+    vocabulary = VocabularyEntry.of(
+        with_present_names(model.vocabulary), model.spec.A, manifest.vocabulary.profiles
+    )
+    fields = {name: getattr(manifest, name) for name in Description.model_fields}
+    fields |= {"version": version, "created": _now(), "vocabulary": vocabulary}
+    return publish_rounded(store, Description(**fields), model)
 
 
 def with_statistics(model: SceneModel, scenes: SplitScenes) -> SceneModel:
