@@ -91,7 +91,8 @@ def test_numbers_can_be_typed(board: Board) -> None:
 NO_SCENES: list[tuple[Any, str]] = [
     ("{", "neither JSON nor JSON lines"),
     ('{"objects": ["bed"]\n{"objects": ', "neither JSON nor JSON lines"),
-    ({"detections": [None]}, "no hypothesis with a score"),
+    ({"detections": [None]}, "no known format"),
+    ({"detections": [{"results": []}]}, "no hypothesis with a score"),
     ({"objects": [{"label": "bed", "size": [-1, 1, 1]}]}, "numbers x, y, z from 0"),
     ({"objects": [{"id": "a", "label": "bed"}] * 2}, "another object"),
     ({"objects": [{"label": "bed", "position": [1e9, 0, 0]}]}, "100 000 km"),

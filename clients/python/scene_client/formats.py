@@ -114,10 +114,10 @@ def chosen(scenes: Mapping[str, Reader], scene: object, file: str = "") -> Reade
         raise MessageError(f"the file has one scene, and no scene {scene}")
     names = ", ".join(short(name)[:24] for name in islice(scenes, 5)) + ", …" * (len(scenes) > 5)
     first = next((name for name in scenes if name and name == short(name)), "")
-    how = f"{file}:{first}" if file else f"scene={first!r}"
-    problem = "" if scene is None else f"no scene {scene}; it has "
+    how = f", such as {file}:{first}" if file else f", such as scene={first!r}"
+    problem = "" if scene is None else f"no scene {short(str(scene))}; it has "
     raise MessageError(
-        f"the file has {problem}{len(scenes)} scenes ({names}): choose one, such as {how}"
+        f"the file has {problem}{len(scenes)} scenes ({names}): choose one{how if first else ''}"
     )
 
 

@@ -196,7 +196,8 @@ def _scene_names(form: Form, records: list[Record]) -> list[str]:
     varying: list[list[list[str]]] = [[], [], []]  # columns of places, of frames and of times
     for name in names:
         kind = names_scene(name)
-        if kind is not None and (column := _column(name, records)) is not None:
+        column = None if kind is None else _column(name, records)
+        if kind is not None and column is not None and column not in varying[kind]:
             varying[kind].append(column)
     # The times of the objects of one frame may differ.
     columns = varying[0] + (varying[1] or varying[2])
