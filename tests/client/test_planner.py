@@ -234,7 +234,7 @@ def test_places_that_count_for_nothing_are_named(scene: Client) -> None:
         call = {"objects": things, "relations": relations}
         answer = planner.call(scene, "find_out_of_place", call)
         left_out = ", ".join(f'"{one}"' for one in stated) or '"desk on-top bed"'
-        assert answer.startswith(f"I left out {left_out} (measured positions replace relations")
+        assert answer.startswith(f"I left out {left_out} (I use relations between listed objects")
     answer = planner.call(scene, "imagine_room", {"room_type": "bedroom", "objects": ["pole"]})
     assert answer.startswith('I left out "pole" (the kind of the room decides).')
 

@@ -183,7 +183,10 @@ class SuggestMissing(_SceneTool):
         if "only" in fields:
             fields["candidates"] = fields.pop("only")
         found = client.missing(**fields, top_k=8)
-        said = sentences.missing(found, only=self.only is not None)
+        said = [*sentences.missing(found, only=self.only is not None)]
+        labels = {one if isinstance(one, str) else one.label for one in self.objects}
+        if listed := [name for name in self.only or () if name in labels]:
+            said.insert(0, f"Already listed: {', '.join(listed)}.")
         return sentences.text(found, said, unused=self.unused())
 
 

@@ -59,7 +59,7 @@ def text(
     """
     words = [*_words(answer, rooms)]
     if unused:
-        rule = "measured positions replace relations, which are between listed objects"
+        rule = "I use relations between listed objects, and none beside measured positions"
         if isinstance(answer, GenerateAnswer):
             rule = "the kind of the room decides"
         words.append(f"I left out {', '.join(map(_quoted, unused))} ({rule}).")
@@ -85,6 +85,11 @@ def _words(answer: Answer, rooms: Collection[str]) -> Iterator[str]:
             yield f'I know "{entry.label}" only by its meaning, {guess}.'
         elif entry.class_ not in entry.label.lower():
             yield f'I read "{entry.label}" as {entry.class_}.'
+    named = {entry.label for entry in answer.mapped}
+    for one in answer.outliers if isinstance(answer, OutliersAnswer) else ():
+        word = one.listed_as
+        if word and word not in named and word.lower().rstrip("s") != one.label:
+            yield f'I read "{word}" as {one.label}.'
 
 
 def _warnings(answer: Answer) -> Iterator[str]:
@@ -177,13 +182,14 @@ def where(answer: WhereAnswer) -> Iterator[str]:
     for room in answer.rooms:
         spots = [spot for spot in answer.places if spot.room == room.room]
         likely = [spot for spot in spots if spot.probability >= _LEAST_SPOT and spot.object]
-        places = (f"{_spot(spot)} {_number(spot.probability)}" for spot in likely[:_MOST_SPOTS])
+        kind = answer.label if answer.listed_as else ""
+        places = (f"{_spot(one, kind)} {_number(one.probability)}" for one in likely[:_MOST_SPOTS])
         rooms.append((room.room, room.probability, ", ".join(places)))
     entries = [room for room in rooms if room[1] >= MENTIONED]
     yield from _split(entries, f"Probable place of {thing}", f"I am not sure about {thing}.")
     best = max((one for one in answer.places if one.object), key=_likelihood, default=None)
     if best is not None and entries and best.room != entries[0][0]:
-        yield f"Best single place: {_spot(best)} in {best.room} ({_number(best.probability)})."
+        yield f"Best single place: {_spot(best, '')} in {best.room} ({_number(best.probability)})."
     yield f"In none of these rooms: {_number(answer.not_here)}."
 
 
@@ -191,9 +197,10 @@ def _likelihood(spot: Spot) -> float:
     return spot.probability
 
 
-def _spot(spot: Spot) -> str:
+def _spot(spot: Spot, kind: str) -> str:
+    """Return a place in words. ``kind`` is the class of the thing, if it has another name."""
     if spot.is_listed or spot.relation is None:
-        return f"already seen: {spot.object}"
+        return f"already seen: {spot.object}{f', if you mean any {kind}' if kind else ''}"
     return f"{PREPOSITIONS[spot.relation]} {spot.object}"
 
 
@@ -208,7 +215,7 @@ def rooms(answer: RoomsAnswer, objects: Collection[str]) -> Iterator[str]:
         yield from _split(entries, "This is probably", "I am not sure which room this is.")
     else:
         (thing,) = objects
-        yield from _split(entries, f"Usual rooms of {thing}", f"{thing} may be in many rooms.")
+        yield from _split(entries, f"Usual rooms of {thing}", f"I am not sure about {thing}.")
     if not any(one.because for one in answer.room_types):
         yield "No object points clearly to one of these rooms."
 
@@ -270,7 +277,7 @@ def _facts(lead: str, facts: Collection[Fact]) -> Iterator[str]:
             f"{name} ({'; '.join(filter(None, (_number(probability), note)))})"
             for name, probability, note in list(facts)[:MOST]
         ]
-        yield f"{lead}: {', '.join(listed)}."
+        yield f"{lead}: {', '.join(listed)}{', …' if len(facts) > MOST else ''}."
 
 
 def _number(probability: float) -> str:
