@@ -305,7 +305,7 @@ def _what_text(lines: list[str]) -> str:
 # ------------------------------------------------------------------------- YAML, XML and MCAP
 
 
-def extra(module: str) -> Any:
+def _extra(module: str) -> Any:
     """Return a module of the extra ``files``.
 
     Raises:
@@ -320,7 +320,7 @@ def extra(module: str) -> Any:
 
 def _yaml(text: str) -> Any:
     """Return the value of a text in YAML, or None for other text."""
-    values = [value for value in yaml_values(text) if value not in (None, "")]
+    values = [value for value in _yaml_values(text) if value not in (None, "")]
     if not all(isinstance(value, dict | list) for value in values):
         return None
     if len(values) == 1:
@@ -328,13 +328,13 @@ def _yaml(text: str) -> Any:
     return Parts({str(n): partial(copy, value) for n, value in enumerate(values, 1)})
 
 
-def yaml_values(text: str) -> list[Any]:
+def _yaml_values(text: str) -> list[Any]:
     """Return the documents of a text in YAML, as `ros2 topic echo` prints them.
 
     Raises:
         MessageError: the text is not YAML, or has anchors, or PyYAML is not installed.
     """
-    yaml = extra("yaml")
+    yaml = _extra("yaml")
     if len(text) > _MOST_YAML:
         raise MessageError(f"this is YAML of more than {_MOST_YAML} characters: convert it to JSON")
     depth, deepest = 0, max(len(line) - len(line.lstrip(" -?")) for line in text.splitlines())
@@ -407,8 +407,8 @@ def _element(element: ElementTree.Element) -> Any:
 
 def _messages(content: bytes) -> Parts:
     """Return the messages of a recording (MCAP) by topic and number: of ROS 2, or in JSON."""
-    reader, kinds = extra("mcap.stream_reader"), extra("mcap.records")
-    factory = extra("mcap_ros2.decoder").DecoderFactory()
+    reader, kinds = _extra("mcap.stream_reader"), _extra("mcap.records")
+    factory = _extra("mcap_ros2.decoder").DecoderFactory()
     schemas, channels, parts, left = {}, {}, Parts(), MOST_MESSAGES
     counts: Counter[str] = Counter()
     try:
@@ -446,10 +446,10 @@ def _decoded(decode: Callable[[bytes], Any], data: bytes) -> Any:
 def _unpacked(chunk: Any, most: int) -> Any:
     """Return a chunk of a recording with its data as they are, of at most so many bytes."""
     if chunk.compression == "zstd":
-        stream = extra("zstandard").ZstdDecompressor().stream_reader(chunk.data)
+        stream = _extra("zstandard").ZstdDecompressor().stream_reader(chunk.data)
         data = stream.read(most + 1)
     elif chunk.compression == "lz4":
-        data = extra("lz4.frame").LZ4FrameDecompressor().decompress(chunk.data, most + 1)
+        data = _extra("lz4.frame").LZ4FrameDecompressor().decompress(chunk.data, most + 1)
     else:
         data = chunk.data
     if len(data) > most:

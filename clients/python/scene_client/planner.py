@@ -71,10 +71,7 @@ def _spoken(read: Callable[[str], dict[str, Any]]) -> BeforeValidator:
 
 Objects = Annotated[SomeObjects, WithJsonSchema(_OBJECTS)]
 Labels = Annotated[list[Label], WithJsonSchema(_TEXTS)]
-Stated = Annotated[
-    Relation | Label,
-    BeforeValidator(_as_relation),
-]
+Stated = Annotated[Relation | Label, BeforeValidator(_as_relation)]
 Relations = Annotated[list[Stated], WithJsonSchema(_TEXTS)]
 Place = Annotated[Anchor, _spoken(phrases.place), WithJsonSchema({"type": "string"})]
 Home = Annotated[

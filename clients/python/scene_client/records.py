@@ -29,7 +29,7 @@ FORMATS: Final[list[Form]] = TABLE["formats"]
 RECORDS: Final[Form] = TABLE["records"]
 """The format of a list of records, whose fields are found by their names."""
 LABEL_MAP: Final[Form] = FORMATS[-1]
-"""The format of a list of class names, which is no scene."""
+"""The format of a list of class names. Such a list describes a vocabulary instead of a scene."""
 FIELDS: Final[dict[str, Any]] = TABLE["fields"]
 """Usual names of each kind of field, in the form of `key_of`."""
 

@@ -44,11 +44,6 @@ def members(message: Any) -> Iterator[tuple[str, Any]]:
         yield name, getattr(message, name, None)
 
 
-def has(message: Any, name: str) -> bool:
-    """Return whether a message has a field with this name. The value of the field may be null."""
-    return name in message if isinstance(message, Mapping) else hasattr(message, name)
-
-
 def items(field: Any, name: str) -> Sequence[Any]:
     """Return the entries of a list field, or an empty sequence for a missing field.
 
