@@ -8,16 +8,19 @@ import os
 import signal
 import socket
 import struct
-from contextlib import suppress
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from time import monotonic
 from types import FrameType
-from typing import Final
+from typing import Any, Final
 
 import uvicorn
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 
 from app.errors import ServiceError
 from app.main import create_app
-from app.serving.logs import log_config
+from app.serving.logs import flush, log_config
 from app.serving.runtime import Runtime
 from app.settings import Settings, warnings
 
@@ -27,6 +30,33 @@ _ANY: Final = frozenset(("0.0.0.0", "::"))  # noqa: S104 # nosec B104
 _SIOCGIFADDR: Final = 0x8915
 
 _logger = logging.getLogger("app.server")
+
+
+class Connection(HttpToolsProtocol):
+    """A connection that tells each pipelined request that the client has disconnected.
+
+    uvicorn tells only the last request. The request in progress would then fail at its answer,
+    because the connection is closed, and would count as a defect of the service.
+    """
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._unfinished: deque[RequestResponseCycle] = deque()
+
+    def on_headers_complete(self) -> None:
+        """Begin a request, or queue it behind the request in progress."""
+        super().on_headers_complete()
+        while self._unfinished and self._unfinished[0].response_complete:
+            self._unfinished.popleft()
+        self._unfinished.append(self.cycle)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Tell all requests that the client has disconnected."""
+        for request in self._unfinished:
+            request.disconnected = not request.response_complete
+            request.message_event.set()
+        self._unfinished.clear()
+        super().connection_lost(exc)
 
 
 class Server(uvicorn.Server):
@@ -46,7 +76,7 @@ class Server(uvicorn.Server):
         config = uvicorn.Config(
             app,
             root_path=settings.root_path,
-            http="httptools",
+            http=Connection,
             ws="none",
             limit_concurrency=settings.max_connections,
             # A proxy must close idle connections earlier. Otherwise it may send a request while the
@@ -121,9 +151,19 @@ class Server(uvicorn.Server):
                 port,
             )
 
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Handle signals in the ``with`` block. After it, they end the process as usual."""
+        with super().capture_signals():
+            try:
+                yield
+            finally:
+                flush()
+
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Start the shutdown, or end its first step. During the start, end the process at once."""
         if not self.started:
+            flush()
             signal.signal(sig, signal.SIG_DFL)
             signal.raise_signal(sig)
         is_first, self._runtime.draining = not self._runtime.draining, True
