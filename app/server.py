@@ -18,6 +18,7 @@ from typing import Any, Final
 import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 
+from app.api.health import HealthPort
 from app.errors import ServiceError
 from app.main import create_app
 from app.serving.logs import flush, log_config
@@ -68,10 +69,11 @@ class Server(uvicorn.Server):
     2. The server closes the listening socket.
     3. The server finishes the requests in progress.
 
-    ``began`` is `time.monotonic()` at the start of the process.
+    ``began`` is `time.monotonic()` at the start of the process. ``health`` are the sockets of the
+    port for health checks.
     """
 
-    def __init__(self, settings: Settings, began: float) -> None:
+    def __init__(self, settings: Settings, began: float, health: list[socket.socket]) -> None:
         app = create_app(settings)
         config = uvicorn.Config(
             app,
@@ -94,6 +96,8 @@ class Server(uvicorn.Server):
         for warning in warnings():
             _logger.warning(warning)
         self._runtime: Runtime = app.state.runtime
+        self._health = HealthPort(self._runtime, health) if health else None
+        self._watching: asyncio.Task[None] | None = None
         self._settings = settings
         self._closing_at: float | None = None
         self._began = began
@@ -114,6 +118,8 @@ class Server(uvicorn.Server):
             self.started = False
             await self.lifespan.shutdown()
             raise
+        if self._health is not None:
+            self._watching = asyncio.create_task(self._health.watch())
         asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self._handle_hangup)
         self._log_addresses(sockets or [])
 

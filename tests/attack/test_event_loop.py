@@ -1,4 +1,4 @@
-"""Unread logs, departed clients and floods of refusals: the event loop answers other clients."""
+"""Unread logs, departed clients, floods of refusals and a busy event loop: others are served."""
 
 import asyncio
 import json
@@ -9,7 +9,8 @@ import socket
 import struct
 import threading
 from collections.abc import Iterator
-from contextlib import AsyncExitStack, closing, contextmanager, suppress
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AsyncExitStack, ExitStack, closing, contextmanager, suppress
 from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,16 @@ import pytest
 
 from app.serving.admission import Ticket
 from benchmarks.load.connections import prepared
-from tests.services import PATIENCE, LiveService, begin, free_port, live_service, serve, wait_until
+from tests.services import (
+    PATIENCE,
+    LiveService,
+    begin,
+    free_port,
+    launch,
+    live_service,
+    serve,
+    wait_until,
+)
 
 SCENE = {"objects": ["bed", "lamp"]}
 QUEUED = 50  # lines that wait for the reader of the log, at most
@@ -170,3 +180,67 @@ async def test_cheap_answers_take_turns(shared_store, path, headers, status):
         await every
     assert answered.index(("10.0.0.2", 200)) < 20
     assert answered.count(("10.0.0.1", status)) == 200
+
+
+BUSY = """
+import sys
+from pathlib import Path
+import app.api.health
+from app.__main__ import main
+from app.questions.missing import MISSING
+
+answer, begun, release = MISSING.answer, Path({begun!r}), Path({release!r})
+
+def busy(model, scene, *args, **parameters):
+    if len(scene.objects) == 5:
+        begun.touch()
+        while not release.exists():
+            pass
+    return answer(model, scene, *args, **parameters)
+
+MISSING.answer = busy
+app.api.health.HUNG_SECONDS = {hung}
+sys.exit(main())
+"""
+"""A program for `launch`: a question about five objects holds the loop until a file exists."""
+
+
+@pytest.mark.system
+@pytest.mark.parametrize(("hung", "status"), [(1e9, 200), (0.1, 503)], ids=["busy", "hung"])
+def test_health_checks_of_a_busy_event_loop(shared_store, tmp_path, hung, status):
+    begun, release, port = tmp_path / "begun", tmp_path / "release", free_port()
+    program = BUSY.format(begun=str(begun), release=str(release), hung=hung)
+
+    def check(path: str) -> tuple[int, str]:
+        response = httpx.get(f"http://127.0.0.1:{port}/health/{path}", timeout=PATIENCE)
+        assert response.headers["connection"] == "close"
+        document = response.json()
+        return response.status_code, document.get("detail", document["status"])
+
+    with (
+        launch(
+            *(shared_store, tmp_path / "log"),
+            program=("-c", program),
+            SCENE_HEALTH_PORT=str(port),
+        ) as service,
+        ThreadPoolExecutor() as pool,
+        ExitStack() as stack,
+    ):
+        five = {"objects": ["bed", "lamp", "desk", "chair", "sofa"]}
+        question = pool.submit(service.client.post, "/missing", json=five)
+        try:
+            wait_until(begun.exists, service.log)
+            wait_until(lambda: check("live")[0] == status)
+            for _ in range(100):  # silent connections
+                address = ("127.0.0.1", port)
+                stack.enter_context(socket.create_connection(address, timeout=PATIENCE))
+            for path in ("live", "ready") * 10:
+                answered, text = check(path)
+                assert answered == status
+                assert text == path or text.startswith("The event loop has not run for ")
+            assert not question.done()
+        finally:
+            release.touch()
+        assert question.result().status_code == 200
+        wait_until(lambda: check("live") == (200, "live"))
+        wait_until(lambda: check("ready") == (200, "ready"))
