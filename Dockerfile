@@ -93,14 +93,15 @@ ENV HOME=/tmp \
     NUMBA_CACHE_DIR=/tmp/compiled \
     SCENE_HOST=0.0.0.0 \
     SCENE_PORT=8000 \
+    SCENE_HEALTH_PORT=8081 \
     SCENE_STORE=/srv/scene/model_store
 USER 10001:10001
 LABEL org.opencontainers.image.title=scene-boltzmann \
     org.opencontainers.image.version=2.0.0 \
     org.opencontainers.image.licenses=Apache-2.0
-EXPOSE 8000
+EXPOSE 8000 8081
 # http.client, unlike urlopen, never takes a proxy that the environment names.
 HEALTHCHECK --interval=10s --timeout=3s --start-period=60s --retries=3 \
-    CMD ["python", "-c", "import http.client, os, sys; c = http.client.HTTPConnection('127.0.0.1', int(os.environ['SCENE_PORT']), timeout=2); c.request('GET', '/health/ready'); sys.exit(c.getresponse().status != 200)"]
+    CMD ["python", "-c", "import http.client, os, sys; c = http.client.HTTPConnection('127.0.0.1', int(os.environ['SCENE_HEALTH_PORT']), timeout=2); c.request('GET', '/health/ready'); sys.exit(c.getresponse().status != 200)"]
 # The compiler's cache must be writable, and /tmp alone is.
 CMD ["sh", "-c", "mkdir -p $NUMBA_CACHE_DIR && cp -R compiled/. $NUMBA_CACHE_DIR && exec python -m app"]

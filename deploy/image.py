@@ -270,7 +270,8 @@ class Buildah:
         self.container = run(*self.command("from", self.image))
         self.root = Path(run(*self.command("mount", self.container)))
         self.started = time.time()
-        self.variables = ["--env", "SCENE_HOST=127.0.0.1", "--env", f"SCENE_PORT={port}"]
+        settings = "SCENE_HOST=127.0.0.1", f"SCENE_PORT={port}", f"SCENE_HEALTH_PORT={free_port()}"
+        self.variables = [part for setting in settings for part in ("--env", setting)]
         with self.output.open("w") as log:
             streams = {"stdout": log, "stderr": log, "text": True}
             self.service = subprocess.Popen(self.inside(config["Cmd"]), **streams)
@@ -364,6 +365,14 @@ def is_plausible(answers: dict[str, Any]) -> dict[str, bool]:
     }
 
 
+def free_port() -> int:
+    """Return a free port of the loopback address."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
 def wait_until_healthy(engine: Docker | Buildah, check: list[str]) -> float:
     """Wait until the HEALTHCHECK succeeds, and return the seconds."""
     started = time.monotonic()
@@ -392,10 +401,7 @@ def check(engine: Docker | Buildah) -> None:
     kind, *healthcheck = (config.get("Healthcheck") or {}).get("Test") or ["NONE"]
     if kind != "CMD":
         raise ImageError("the image has no HEALTHCHECK with a list of arguments")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    engine.start(config, port)
+    engine.start(config, port := free_port())
     print(f"healthy after {wait_until_healthy(engine, healthcheck):.1f} s", flush=True)
     engine.execute(["sh", "-c", CONTENTS])
     answers = {question: ask(port, question, body) for question, body in QUESTIONS}

@@ -102,7 +102,7 @@ def test_manifests_fit_the_schemas_of_kubernetes(overlay: Overlay) -> None:
 def test_probes_ask_routes_of_the_service(overlay: Overlay) -> None:
     container = overlay.container
     routes = create_app(Settings(_env_file=None)).openapi()["paths"]
-    (port,) = container["ports"]
+    _, port = container["ports"]
     probes = [container[f"{name}Probe"]["httpGet"] for name in ("startup", "liveness", "readiness")]
     assert all(probe["path"] in routes and probe["port"] == port["name"] for probe in probes)
     assert [probe["path"] for probe in probes[1:]] == ["/health/live", "/health/ready"]
@@ -113,14 +113,17 @@ def test_probes_ask_routes_of_the_service(overlay: Overlay) -> None:
 
 def test_ports_are_those_of_the_image(repository: Path, overlay: Overlay) -> None:
     stage = split_stages((repository / "Dockerfile").read_text("utf-8"))["runtime"]
-    (exposed,) = map(int, re.findall(r"^EXPOSE (\d+)$", stage, re.MULTILINE))
-    assert f"SCENE_PORT={exposed}" in stage
-    assert overlay.config["SCENE_PORT"] == str(exposed)
-    (opened,) = overlay.container["ports"]
-    assert opened["containerPort"] == exposed
+    (exposed,) = re.findall(r"^EXPOSE (\d+) (\d+)$", stage, re.MULTILINE)
+    for name, number in zip(("SCENE_PORT", "SCENE_HEALTH_PORT"), exposed, strict=True):
+        assert f"{name}={number}" in stage
+        assert overlay.config[name] == number
+    opened = overlay.container["ports"]
+    assert [str(port["containerPort"]) for port in opened] == list(exposed)
     for name in ("scene", "scene-replicas"):
         (port,) = overlay.spec("Service", name)["ports"]
-        assert (port["port"], port["targetPort"]) == (exposed, opened["name"])
+        assert (str(port["port"]), port["targetPort"]) == (exposed[0], opened[0]["name"])
+    (rule,) = overlay.spec("NetworkPolicy")["ingress"]
+    assert [str(port["port"]) for port in rule["ports"]] == list(exposed)
 
 
 def test_variables_are_valid_settings(monkeypatch, repository, overlay):

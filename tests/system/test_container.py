@@ -40,15 +40,23 @@ def test_stages_have_no_root(stages: dict[str, str], compose: dict[str, Any], na
 def test_the_default_stage_serves(stages: dict[str, str]) -> None:
     assert list(stages)[-1] == "runtime"
     assert '&& exec python -m app"]' in stages["runtime"]
-    assert "/health/ready" in stages["runtime"].split("HEALTHCHECK")[1]
+    check = stages["runtime"].split("HEALTHCHECK")[1]
+    assert "SCENE_HEALTH_PORT" in check
+    assert "/health/ready" in check
     assert "training" not in stages["runtime"]
 
 
 def test_variables_are_settings(stages: dict[str, str], compose: dict[str, Any]) -> None:
     known = {f"SCENE_{field.upper()}" for field in Settings.model_fields}
     in_image = set(re.findall(r"\bSCENE_\w+(?==)", stages["runtime"]))
-    assert {"SCENE_HOST", "SCENE_PORT", "SCENE_STORE"} <= in_image <= known
+    assert {"SCENE_HOST", "SCENE_PORT", "SCENE_HEALTH_PORT", "SCENE_STORE"} <= in_image <= known
     assert compose["services"]["scene"]["environment"].keys() <= known
+
+
+def test_the_proxy_checks_the_health_port(stages, compose, configuration):
+    port = compose["services"]["scene"]["environment"]["SCENE_HEALTH_PORT"]
+    assert f"SCENE_HEALTH_PORT={port} " in stages["runtime"]
+    assert f'check port "${{PROXY_HEALTH_PORT-{port}}}"' in configuration.read_text("utf-8")
 
 
 @pytest.mark.parametrize(
