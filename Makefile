@@ -16,7 +16,8 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 # One worker more than cores, because the tests spend a third of their time waiting.
 WORKERS ?= $$(($$($(BIN)/python -c 'import os; print(os.cpu_count())') + 1))
 PYTEST := $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadscope --no-loadscope-reorder
-TORCH := -r requirements-torch.lock $(if $(TORCH_INDEX_URL),--index-url $(TORCH_INDEX_URL))
+TORCH := $(if $(TORCH_INDEX_URL),--require-hashes -r requirements-torch-cpu.lock --index-url $(TORCH_INDEX_URL),\
+	-r requirements-torch.lock)
 
 # Where this is set, every process of the tests compiles all sources again, for up to two seconds.
 unexport PYTHONDONTWRITEBYTECODE
@@ -128,12 +129,12 @@ $(SERVICE): requirements.lock pyproject.toml clients/python/pyproject.toml | $(B
 	@echo "Compiled."
 	@touch $@
 
-$(TRAINING): requirements-training.lock requirements-torch.lock pyproject.toml clients/python/pyproject.toml | $(BIN)/python
+$(TRAINING): requirements-training.lock requirements-torch.lock requirements-torch-cpu.lock pyproject.toml clients/python/pyproject.toml | $(BIN)/python
 	@echo "Installing the packages of the service and of training into $(VENV) ..."
 	$(call install,requirements-training.lock)
 	@touch $(SERVICE) $@
 
-$(EVERYTHING): requirements-dev.lock requirements-torch.lock pyproject.toml clients/python/pyproject.toml | $(BIN)/python
+$(EVERYTHING): requirements-dev.lock requirements-torch.lock requirements-torch-cpu.lock pyproject.toml clients/python/pyproject.toml | $(BIN)/python
 	@echo "Installing every package into $(VENV) ..."
 	$(call install,requirements-dev.lock)
 	@touch $(SERVICE) $(TRAINING) $@

@@ -21,7 +21,6 @@ from enum import Enum
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-# The lock file of torch has no hashes, because its build depends on the machine.
 TORCH = "requirements-torch.lock"
 LOCKS = ("requirements.lock", "requirements-training.lock", "requirements-dev.lock", TORCH)
 # Lock files of the two container images. The images contain no development tools.

@@ -59,6 +59,30 @@ def test_workflows_run_every_python_of_the_packages(repository: Path) -> None:
         assert re.fullmatch(r"[\w/-]+@[0-9a-f]{40}", step["uses"]), "actions are pinned by commit"
 
 
+def images(text: str) -> set[str]:
+    """Return the images of a Dockerfile, a compose file or a manifest, without stages of builds."""
+    stages = set(re.findall(r"^FROM .+ AS (\S+)$", text, re.MULTILINE))
+    found = re.findall(r"(?:^FROM|^[ -]+image:(?: &\w+)?) ([^\s*]\S*)", text, re.MULTILINE)
+    return {*found} - stages
+
+
+def test_images_of_others_have_a_digest(repository: Path) -> None:
+    """A tag may name another image tomorrow. Images of this repository are built by its users."""
+    files = [repository / "Dockerfile", repository / "docker-compose.yml"]
+    files += sorted((repository / "deploy").rglob("*.yaml"))
+    found = set().union(*(images(path.read_text("utf-8")) for path in files))
+    others = {name for name in found if "scene-boltzmann" not in name}
+    repositories = {name.partition(":")[0] for name in others}
+    expected = {"python", "haproxy", "prom/prometheus", "grafana/grafana", "rclone/rclone"}
+    assert repositories == expected
+    for name in others:
+        assert re.fullmatch(r"[a-z/]+:[\w.-]+@sha256:[0-9a-f]{64}", name), name
+    pages = [repository / "README.md", *(repository / "docs").rglob("*.md")]
+    for page in pages:
+        for name in re.findall(rf"\b(?:{'|'.join(expected)}):\S+", page.read_text("utf-8")):
+            assert "@sha256:" in name, f"{page.name}: {name}"
+
+
 @pytest.fixture
 def units(repository: Path, tmp_path: Path) -> Path:
     """A folder with the units of systemd, with this interpreter in place of the installed one."""

@@ -125,24 +125,26 @@ def pins(repository: Path, lock: str) -> set[str]:
     return {line for line in text.splitlines() if "==" in line and not line.startswith("#")}
 
 
-@pytest.mark.parametrize("lock", ["", "-ray", "-training", "-dev"])
+@pytest.mark.parametrize("lock", ["", "-ray", "-training", "-dev", "-torch-cpu"])
 def test_locks_pin_every_package_by_hash_and_name_no_index(repository: Path, lock: str) -> None:
     """`pip install --require-hashes` refuses a package without a hash."""
     text = (repository / f"requirements{lock}.lock").read_text("utf-8").replace("\\\n", "")
     for line in text.splitlines()[1:]:
         pin = r"[a-z0-9-]+==[0-9][0-9a-z.]*( ; .+?)?"
         assert re.fullmatch(rf"{pin}(\s+--hash=sha256:[0-9a-f]{{64}})+\s*", line), line
-    assert not any(pin.startswith("torch==") for pin in pins(repository, lock))
+    has_torch = any(pin.startswith("torch==") for pin in pins(repository, lock))
+    assert has_torch == (lock == "-torch-cpu")
 
 
 def test_only_torch_may_come_from_another_index(repository: Path) -> None:
     assert pins(repository, "-torch") == {"torch==2.13.0"}
+    assert pins(repository, "-torch-cpu") == {"torch==2.13.0 \\"}
     for file in ("Makefile", "Dockerfile"):
         text = (repository / file).read_text("utf-8").replace("\\\n", " ")
         assert "--extra-index-url" not in text
         for line in text.splitlines():
             if "install" in line and "--index-url" in line:
-                assert "--no-deps" in line
+                assert "--no-deps --require-hashes" in line
 
 
 def test_the_base_image_may_have_a_digest() -> None:
