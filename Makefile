@@ -50,7 +50,7 @@ define install
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: checks help run ray test test-fast test-slow coverage docs image audit setup training format bench lock clean
+.PHONY: checks help run ray test test-fast test-slow coverage docs image audit sbom setup training format bench lock clean
 .DELETE_ON_ERROR:
 
 help:  ## show this help
@@ -90,8 +90,11 @@ coverage: $(EVERYTHING)  ## measure which lines the tests run, without the slow 
 docs: $(EVERYTHING)  ## build the documentation as a site that works without internet (build/site)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 
-audit: $(EVERYTHING)  ## report known vulnerabilities and risky code, write bills of materials (build/)
+audit: $(EVERYTHING)  ## report known vulnerabilities and risky code
 	$(BIN)/python scripts/audit.py $(ARGS)
+
+sbom: $(EVERYTHING)  ## write bills of materials of the images' Python packages (CycloneDX, build/)
+	$(BIN)/python -m scripts.sbom
 
 image: $(BIN)/python  ## build the image, ask its service its questions, remove it (Docker or buildah)
 	$(BIN)/python deploy/image.py $(ARGS)

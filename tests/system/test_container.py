@@ -12,7 +12,7 @@ import pytest
 from app.registry import AliasTarget, Store, load_model_set
 from app.registry.references import aliases_to_bytes
 from app.settings import Settings
-from deploy.image import first_base, pip_settings
+from deploy.image import PACKAGES, ImageError, check_packages, first_base, pip_settings
 from tests.conftest import run_program
 
 pytestmark = pytest.mark.system
@@ -145,6 +145,15 @@ def test_only_torch_may_come_from_another_index(repository: Path) -> None:
         for line in text.splitlines():
             if "install" in line and "--index-url" in line:
                 assert "--no-deps --require-hashes" in line
+
+
+def test_the_image_has_the_packages_of_its_lock_file() -> None:
+    installed = run_program(sys.executable, "-c", PACKAGES).stdout.split()
+    lock = "".join(f"{pin} \\\n    --hash=sha256:00\n" for pin in installed)
+    check_packages("\n".join(installed), lock)
+    for listed in (installed[1:], [*installed, "evil==1.0"]):
+        with pytest.raises(ImageError, match="the image and requirements"):
+            check_packages("\n".join(listed), lock)
 
 
 def test_the_base_image_may_have_a_digest() -> None:
