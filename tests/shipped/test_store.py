@@ -41,6 +41,9 @@ def test_the_store_states_replaced_models():
     assert shipped.default == STORE.aliases()["default"]
     assert {*shipped.names.values()} <= {*SHIPPED}
     assert not {*shipped.names} & {*SHIPPED}
+    # Without digests, an upgrade leaves the alias `default` at the old model.
+    without = {name for name, replaced in shipped.replaced.items() if not replaced.digests}
+    assert without == {"procthor-triway"}, "in 1.0.0, this was an alias"
     upgrading = (REPOSITORY / "docs" / "upgrading.md").read_text()
     for old, new in shipped.names.items():
         assert re.search(rf"^\|[^|]*`{old}`[^|]*\| `{new}`", upgrading, re.MULTILINE), old
