@@ -4,10 +4,12 @@ import os
 import re
 import sys
 from configparser import ConfigParser
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import pytest
+from packaging.specifiers import SpecifierSet
 
 from app.registry import AliasTarget, Store, load_model_set
 from app.registry.references import aliases_to_bytes
@@ -134,6 +136,17 @@ def test_locks_pin_every_package_by_hash_and_name_no_index(repository: Path, loc
         assert re.fullmatch(rf"{pin}(\s+--hash=sha256:[0-9a-f]{{64}})+\s*", line), line
     has_torch = any(pin.startswith("torch==") for pin in pins(repository, lock))
     assert has_torch == (lock == "-torch-cpu")
+
+
+def test_packages_accept_the_first_release_of_each_python() -> None:
+    """Debian 12 has Python 3.11.2, and a package that needs 3.11.5 stops its `make test`."""
+    refused = [
+        f"{package.name} {package.version}: Python {required}"
+        for package in metadata.distributions()
+        if (required := package.metadata["Requires-Python"])
+        and not all(SpecifierSet(required).contains(f"3.{minor}.0") for minor in (11, 12, 13))
+    ]
+    assert not refused
 
 
 def test_only_torch_may_come_from_another_index(repository: Path) -> None:
