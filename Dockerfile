@@ -26,11 +26,12 @@ RUN /opt/venv/bin/python -m pip uninstall --yes -q pip setuptools \
 FROM packages AS training-packages
 # The index for CPU builds of torch; without it the default index may bring a CUDA build.
 ARG TORCH_INDEX_URL=""
-COPY requirements-training.lock requirements-torch.lock ./
+COPY requirements-training.lock requirements-torch.lock requirements-torch-cpu.lock ./
 RUN /opt/venv/bin/python -m pip install --no-cache-dir --disable-pip-version-check -q \
         --require-hashes -r requirements-training.lock \
     && /opt/venv/bin/python -m pip install --no-cache-dir --disable-pip-version-check -q \
-        ${TORCH_INDEX_URL:+--no-deps --index-url "$TORCH_INDEX_URL"} -r requirements-torch.lock
+        ${TORCH_INDEX_URL:+--no-deps --require-hashes --index-url "$TORCH_INDEX_URL"} \
+        -r requirements-torch${TORCH_INDEX_URL:+-cpu}.lock
 
 # ---- training: docker run ... train --help
 FROM base AS train

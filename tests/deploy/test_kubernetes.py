@@ -194,12 +194,22 @@ def test_the_network_policy_opens_the_ports_in_use(overlay: Overlay) -> None:
     policy = overlay.spec("NetworkPolicy")
     assert set(policy["policyTypes"]) == {"Ingress", "Egress"}
     (entry,) = policy["ingress"]
+    peers = {name for peer in entry["from"] for name in peer}
+    assert peers == {"podSelector", "namespaceSelector"}
+    access = {"matchLabels": {"scene-access": "true"}}
+    assert all(selector == access for peer in entry["from"] for selector in peer.values())
     opened = [port["containerPort"] for port in overlay.container["ports"]]
     assert [port["port"] for port in entry["ports"]] == opened
     out = {(port["port"], port["protocol"]) for rule in policy["egress"] for port in rule["ports"]}
     dns = {(53, "UDP"), (53, "TCP")}
     has_bucket = any(one["name"] == "bucket" for one in overlay.pod.get("initContainers", ()))
     assert out == (dns | {(443, "TCP")} if has_bucket else dns)
+
+
+def test_the_base_asks_for_a_proxy_and_names_the_label_of_its_policy(folder: Path) -> None:
+    first, *lines = (folder / "base" / "kustomization.yaml").read_text("utf-8").splitlines()
+    assert "needs a proxy in front" in first
+    assert any(re.search(r"kubectl label namespace .+ scene-access=true$", line) for line in lines)
 
 
 def test_the_sidecar_copies_versions(folder: Path, find_tool: FindTool, tmp_path: Path) -> None:
