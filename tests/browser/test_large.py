@@ -1,6 +1,7 @@
 """Scenes of many objects, scenes without alarms, and hostile names."""
 
 import json
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -207,3 +208,32 @@ def test_hostile_names_are_bounded_text(open_board: OpenBoard) -> None:
     assert "r" * 60 not in words
     assert page.locator("main :is(i, u), main b > b").count() == 0
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+
+def test_a_hostile_recording_is_bounded_text(open_board: OpenBoard, tmp_path: Path) -> None:
+    board = open_board(allow=("422",))
+    page = board.page
+    page.set_viewport_size({"width": 390, "height": 844})
+    lines = [
+        {"scene_id": name, "group": name, "room_type": name, "objects": [{"label": name}, "bed"]}
+        for name in (*HOSTILE.values(), 5)
+    ]
+    lines[-1]["objects"] = ["bed", "oven"]
+    file = tmp_path / f"{'f' * 100}.jsonl"
+    file.write_text("".join(f"{json.dumps(line)}\n" for line in lines), "utf-8")
+    for number in range(1, len(HOSTILE) + 1):
+        board.open_file(file)
+        page.locator("#which").fill(str(number))
+        board.click("Put on the board")
+        board.tab("Where")
+        box = page.get_by_role("combobox", name="Thing")
+        box.fill("mug")
+        box.press("Enter")
+        board.settle()
+        text = page.locator("body").text_content() or ""
+        shown = page.evaluate("document.body.innerText")
+        assert not {"\u202e", "\u2066"} & {*shown}
+        assert "w" * 60 not in shown
+        assert "<img src=x" in text
+        assert page.locator("img[src=x]").count() == 0
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")

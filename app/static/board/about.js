@@ -31,6 +31,7 @@ export function createAbout(store, node) {
 
   function draw() {
     const models = new Map(store.get().answers.map(answering).filter(Boolean).map((model) => [`${model.name} ${model.version}`, model]));
+    if (!models.size) return; // The last answering model stays on the screen.
     for (const [key, model] of models) if (!known.has(key)) void learn(model, key);
     const words = JSON.stringify([...models.keys()].map((key) => [key, known.get(key)]));
     if (words === told) return;

@@ -6,7 +6,7 @@ import { accept, ghostsOf, likely, SHIFTED } from './ghosts.js';
 import { common, inWords, QUESTIONS, reading, whyNot } from './questions.js';
 import { classOf, createFolds, reasons, row, some, spoken, verdict } from './rows.js';
 import { changed } from './store.js';
-import { namesOf, percent, SPOKEN, wordOf } from './words.js';
+import { namesOf, percent, shown, SPOKEN, wordOf } from './words.js';
 import { wrongRows } from './wrong.js';
 
 const SEEN = ['answers', 'shown', 'models', 'things', 'tab', 'draft', 'words', 'at', 'posed', 'relations', 'room', 'right', 'line', 'covered'];
@@ -117,7 +117,7 @@ export function problemWords(problem, body) {
   const errors = (problem.errors ?? []).map(({ pointer, message, suggestions = [] }) => {
     const [, field, index] = /^#\/(objects|rooms|label)(?:\/(\d+))?/.exec(pointer) ?? [];
     const about = field === 'label' ? body?.label : body?.[field]?.[index]?.id;
-    return el('li', {}, `${about ? `${about}: ` : ''}${message}${suggestions.length ? ` (${suggestions.join(', ')}?)` : ''}`);
+    return el('li', {}, `${about ? `${shown(about)}: ` : ''}${message}${suggestions.length ? ` (${suggestions.join(', ')}?)` : ''}`);
   });
   return [
     el('b', {}, problem.title), el('p', {}, problem.detail ?? ''),

@@ -8,6 +8,7 @@ import { linesOf } from './records.js';
 import { sizesOf } from './questions.js';
 import { SceneError, toScene } from './scene.js';
 import { toHash } from './share.js';
+import { shown } from './words.js';
 
 const MOST_BYTES = 64 * 2 ** 20; // of a file
 const MOST_SHOWN = 2 ** 20; // bytes; a browser needs a minute to show a text of 50 MB
@@ -55,7 +56,7 @@ export function fileDialog(store, records, recorded, put, say, whenPlaced) {
   }
 
   function nameScene() {
-    get('scenes').textContent = found ? `of ${found.length}: ${found[chosen()].name}` : '';
+    get('scenes').textContent = found ? `of ${found.length}: ${shown(found[chosen()].name)}` : '';
   }
 
   /** The scenes of a text in another format than that of requests. The service reads it and stores nothing. */
@@ -80,7 +81,7 @@ export function fileDialog(store, records, recorded, put, say, whenPlaced) {
     name = file?.name ?? '';
     hidden = isLarge ? text : '';
     area.value = isLarge ? '' : text;
-    done.textContent = isLarge ? `${file.name} is open. It is too large to be shown here.` : '';
+    done.textContent = isLarge ? `${shown(file.name)} is open. It is too large to be shown here.` : '';
     look();
   }
 

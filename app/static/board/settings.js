@@ -9,7 +9,7 @@ import { inWords, isCertain, leftOut, mappedBy, readings, sizesOf } from './ques
 import { sizer } from './scene.js';
 import { searchedOf, spotsOf } from './spots.js';
 import { changed } from './store.js';
-import { namesOf, percent, plain, SPOKEN } from './words.js';
+import { namesOf, percent, plain, shown, SPOKEN } from './words.js';
 
 const get = (id) => document.getElementById(id);
 
@@ -68,7 +68,7 @@ export function settings(store) {
     const likely = new Map(answer.map((one) => [plain(one.room_type), one.probability]));
     const probability = (room) => likely.get(plain(room)) ?? likely.get(plain(mappedBy(state, state.shown, room)?.class ?? ''));
     all.sort((a, b) => (probability(b) ?? 0) - (probability(a) ?? 0));
-    const words = (room) => (probability(room) === undefined ? room : `${room} ${percent(probability(room))}`);
+    const words = (room) => (probability(room) === undefined ? shown(room) : `${shown(room)} ${percent(probability(room))}`);
     get('room').replaceChildren(el('option', { value: '' }, 'unknown'), ...all.map((room) => el('option', { value: room }, words(room))));
     get('room').value = state.room;
     get('room').parentElement.hidden = !all.length;

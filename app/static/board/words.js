@@ -2,8 +2,8 @@
 
 /** @typedef {{label: string, aliases: string[], structure: boolean}} Entry */
 
-/** A label for comparisons: in lower case, with single spaces. */
-export const plain = (text) => text.toLowerCase().replace(/[\s_-]+/g, ' ').trim();
+/** A label for comparisons: in lower case, with single spaces. A file may have a number in its place. */
+export const plain = (text) => String(text).toLowerCase().replace(/[\s_-]+/g, ' ').trim();
 
 function rank(name, wanted) {
   if (name === wanted) return 0;
@@ -41,9 +41,10 @@ const RIGHT_TO_LEFT = /[\u0590-\u08ff\ufb1d-\ufdff\ufe70-\ufefc]/;
 
 /** A text of a request or a file for display: in one line and of bounded length. It turns no text beside it. */
 export function shown(text, most = MOST_SHOWN) {
-  const line = text.slice(0, 2 * most).replace(UNPRINTABLE, '\ufffd');
+  const own = String(text);
+  const line = own.slice(0, 2 * most).replace(UNPRINTABLE, '\ufffd');
   const letters = [...line];
-  const cut = letters.length > most || line.length < text.length ? `${letters.slice(0, most - 1).join('')}…` : line;
+  const cut = letters.length > most || line.length < own.length ? `${letters.slice(0, most - 1).join('')}…` : line;
   return RIGHT_TO_LEFT.test(cut) ? `\u2068${cut}\u2069` : cut; // isolates the direction of the name
 }
 
