@@ -1,8 +1,8 @@
 """True intruders: an adapted model may be quieter about its habits, and never blind.
 
 The hosts are parts of the scenes that the parent stores, and of drawn scenes of the written places.
-Each gets an intruder, and the cases are those that the parent reports. A new model that misses more
-than a tenth of them is refused.
+Each gets an intruder by the popularity of the classes in training, and the cases are those that the
+parent reports. A new model that misses more than a tenth of them is refused.
 """
 
 from __future__ import annotations
@@ -31,15 +31,10 @@ _LEAST, _MOST = 4, 12  # classes of a host
 Case = tuple[Scene, int]  # a scene with an intruder, and the class of the intruder
 
 
-def true_intruders(
-    parent: SceneModel, weights: Float[NDArray[np.float64], "V"], seed: int = 0
-) -> list[Case]:
-    """Return scenes with an intruder that the parent reports.
-
-    The intruder is drawn in proportion to `weights` from the classes that can raise an alarm.
-    """
+def true_intruders(parent: SceneModel, seed: int = 0) -> list[Case]:
+    """Return scenes with an intruder that the parent reports."""
     rng = np.random.default_rng(seed)
-    weights = weights * (parent.vocabulary.judged & ~parent.rarely_shown)
+    weights = _popularity(parent) * (parent.vocabulary.judged & ~parent.rarely_shown)
     cases: list[Case] = []
     for classes, room in _hosts(parent, rng):
         left = weights.copy()
@@ -53,7 +48,7 @@ def true_intruders(
     return cases
 
 
-def popularity(parent: SceneModel) -> Float[NDArray[np.float64], "V"]:
+def _popularity(parent: SceneModel) -> Float[NDArray[np.float64], "V"]:
     """Return the odds of each class in the training scenes of a model; 1 without statistics."""
     found = np.array(parent.calibration.popularity, dtype=np.float64)
     return np.exp(np.nan_to_num(found, nan=-np.inf)) if len(found) else np.ones(parent.spec.V)
