@@ -60,9 +60,9 @@ class WhereRequest(Request):
 
     label: Label
     """label of the wanted thing"""
-    rooms: Annotated[list[HomeRoom], Field(min_length=1, max_length=MAX_ROOMS)]
+    rooms: Annotated[list[HomeRoom], Field(min_length=1, max_length=MAX_ROOMS, fail_fast=True)]
     """the rooms of the home, at most 32, with at most 1,024 objects together"""
-    searched: Annotated[list[Searched], Field(max_length=MAX_THINGS)] = []
+    searched: Annotated[list[Searched], Field(max_length=MAX_THINGS, fail_fast=True)] = []
     """places where the robot has looked for the thing without success"""
     top_k: Annotated[int, Field(ge=1, le=4096)] = 20
     """maximum number of places in the answer"""
