@@ -15,6 +15,7 @@ from app.api import confirm, questions, scenes
 from app.api.questions import QUICK_OBJECTS, QUICK_ROOMS, is_quick, is_small
 from app.api.scenes import MOST_PARTS
 from app.questions import QUESTIONS
+from scene_client.formats import from_data
 from scene_client.schemas import ConfirmRequest, Request, SceneRequest, WhereRequest
 from scene_client.schemas.where import HomeRoom
 from scene_client.validation import MAX_ERRORS
@@ -158,3 +159,14 @@ async def test_a_confirmed_scene_is_written_by_the_worker(shared_store, tmp_path
         problem(await client.post("/confirm", json=named), 422, "invalid-request")
     assert read == ["slow"]
     assert len((tmp_path / "scenes.jsonl").read_bytes().splitlines()) == 1
+
+
+def marked(text: str) -> Any:
+    cube = {"pose": {"position": {"x": 0, "y": 0, "z": 0}}, "size": {"x": 1, "y": 1, "z": 1}}
+    return {"entities": [{"id": "bed", "cubes": [cube], "texts": [{"text": text}]}]}
+
+
+@pytest.mark.parametrize(("length", "label"), [(0, "chair"), (240, "chair"), (260, "bed")])
+def test_a_pattern_reads_short_texts_only(length: int, label: str) -> None:
+    fields = from_data(marked("chair" + " " * length + " (.9)"))
+    assert [one["label"] for one in fields["objects"]] == [label]
