@@ -81,6 +81,22 @@ async def test_large_homes_are_validated_by_the_worker(client, threads, body):
     assert of_batch == ["slow", "MainThread"]
 
 
+async def test_objects_of_a_home_are_counted_before_validation(client):
+    message = "the rooms must have at most 1024 objects together"
+    # The unknown fields of objects would have errors of their own.
+    rooms = [{"id": str(k), "objects": [{"a": 1}] * 33} for k in range(32)]
+    crowded = {"label": "bed", "rooms": rooms}
+    document = problem(await client.post("/where", json=crowded), 422, "invalid-request")
+    found = [(one["pointer"], one["message"]) for one in document["errors"]]
+    assert found == [("#/rooms", message)]
+    (entry,) = (await client.post("/where/batch", json={"scenes": [crowded]})).json()["results"]
+    found = [(one["pointer"], one["message"]) for one in entry["problem"]["errors"]]
+    assert found == [("#/scenes/0/rooms", message)]
+    whole = [HomeRoom(id=str(k), objects=["bed"] * 33) for k in range(32)]
+    with pytest.raises(ValidationError, match=message):
+        WhereRequest(label="bed", rooms=whole)
+
+
 async def test_large_homes_are_answered_by_the_worker(client, threads):
     answered = threads(questions, "_read")
     for rooms, objects in ((QUICK_ROOMS, 8), (QUICK_ROOMS, 8), (QUICK_ROOMS + 1, 1)):
