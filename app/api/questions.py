@@ -183,7 +183,7 @@ def _too_large(question: Question[Any], most: int) -> AnswerTooLargeError:
 QUICK_OBJECTS: Final = 32
 QUICK_ENTRIES: Final = 256
 QUICK_LABELS: Final = 2
-QUICK_ROOMS: Final = 8
+QUICK_ROOMS: Final = 4
 """Largest scene, lists, number of new labels and rooms of a question that the event loop computes.
 
 Such a question takes about 2 ms.
@@ -203,10 +203,14 @@ def is_quick(request: SceneRequest | WhereRequest, vocabulary: Vocabulary) -> bo
 
 
 def is_small(scene: Mapping[str, Any]) -> bool:
-    """Return whether the event loop may validate a scene, given by its fields."""
+    """Return whether the event loop may validate a scene or a home, given by its fields."""
     for name, value in scene.items():
         if isinstance(value, list):
-            if len(value) > (QUICK_OBJECTS if name == "objects" else QUICK_ENTRIES):
+            if name == "rooms":
+                rooms = [room for room in value if isinstance(room, dict)]
+                if len(value) > QUICK_ROOMS or not all(map(is_small, rooms)):
+                    return False
+            elif len(value) > (QUICK_OBJECTS if name == "objects" else QUICK_ENTRIES):
                 return False
         elif name == "top_k" and isinstance(value, int) and value > QUICK_ENTRIES:
             return False

@@ -16,6 +16,7 @@ from app.api.openapi import error_responses, operation_id
 from app.errors import InvalidRequestError, UnreadableFileError
 from app.serving.runtime import Runtime
 from scene_client.files import labels_in, scenes_of
+from scene_client.parsing import text_of
 from scene_client.ros_fields import MessageError
 from scene_client.schemas import MAX_BATCH, FieldError, FileNote, ScenesAnswer, ScenesRequest
 
@@ -26,7 +27,12 @@ The parsers of JSON and XML hold the interpreter lock. This number bounds their 
 the time of the conversion to about a second.
 """
 
-_MARKS: Final = {b"\n": 1, b"[": 1, b"{": 1, b"<": 1, b"=": 1, b",": 8}  # times MOST_PARTS
+# The first marks end lines, as `str.splitlines` finds them. The others stand between parts.
+_MARKS: Final = {
+    **dict.fromkeys("\n\r\v\f\x1c\x1d\x1e\x85\u2028\u2029[{<=", 1),
+    **dict.fromkeys((",", ";", "|", " . "), 8),
+}
+"""Maximum number of each mark in a file, times `MOST_PARTS`."""
 
 _MOST_NOTES: Final = 16  # of one scene
 _MOST_CHARACTERS: Final = 300  # of one message
@@ -55,10 +61,8 @@ async def scenes(data: ScenesRequest, http: Request) -> bytes:
 def _read(data: ScenesRequest, request_id: str, limit: int, stop: Callable[[], bool]) -> bytes:
     """Return the answer as JSON, with at most ``limit`` bytes of scenes. ``stop`` ends it early."""
     content = _content(data)
-    if any(content.count(mark) > most * MOST_PARTS for mark, most in _MARKS.items()):
-        detail = f"The file has more than {MOST_PARTS} entries. The command `scene` reads it."
-        raise UnreadableFileError(detail=detail)
     try:
+        _require_few(content)
         labels = None if data.label_map is None else labels_in(data.label_map)
         readers = scenes_of(content, labels)
     except MessageError as error:
@@ -96,6 +100,17 @@ def _read(data: ScenesRequest, request_id: str, limit: int, stop: Callable[[], b
         b",".join(converted),
         to_json(notes),
     )
+
+
+def _require_few(content: bytes) -> None:
+    """Raise MessageError if a file in text has too many parts."""
+    try:
+        text = text_of(content)
+    except MessageError:  # `scenes_of` knows some other formats
+        return
+    if any(text.count(mark) > most * MOST_PARTS for mark, most in _MARKS.items()):
+        words = f"The file has more than {MOST_PARTS} entries. The command `scene` reads it."
+        raise MessageError(words)
 
 
 def _content(data: ScenesRequest) -> bytes:

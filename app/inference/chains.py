@@ -52,8 +52,19 @@ Bits = UInt8[NDArray, " V"]
 OTHER_ROOM = np.float32(6.0)
 """Reduction of the log weight of stored scenes whose room type differs from the requested one."""
 
+MOST_DRAWN = 256
+"""Maximum number of classes that a chain adds to the required ones.
+
+Three times as many as shipped models add at the highest temperature. The arrays of relations have
+the square of the number of classes.
+"""
+
 # A chain generates the random numbers of this many sweeps in one call.
 _AT_ONCE = 64
+
+
+class CrowdedSceneError(ValueError):
+    """A chain has added more than `MOST_DRAWN` classes to a scene."""
 
 
 def random_stream(seed: int, number: int) -> np.random.Generator:
@@ -183,7 +194,11 @@ class ConditionedChains:
         return self._others[room]
 
     def draw(self, steps: int, stream: np.random.Generator) -> ChainState:
-        """Run ``steps`` sweeps of one chain with its random stream and return its final state."""
+        """Run ``steps`` sweeps of one chain with its random stream and return its final state.
+
+        Raises:
+            CrowdedSceneError: the scene has too many classes.
+        """
         on, room = np.zeros(self._machine.spec.V, np.uint8), self._room
         if self._machine.spec.N:
             start = int(np.searchsorted(self._start_cdf[:-1], stream.random(), "right"))
@@ -197,6 +212,9 @@ class ConditionedChains:
         """Return the state of a chain after ``steps`` sweeps, which change the classes ``on``."""
         h1 = self.sweep(on, steps, stream)
         classes = np.flatnonzero(on)
+        if (drawn := len(classes) - len(self._conditions.classes)) > MOST_DRAWN:
+            most = f"more than the maximum of {MOST_DRAWN}"
+            raise CrowdedSceneError(f"the model draws {drawn} classes for one scene, {most}")
         logits = self._logits(classes, h1)
         r = self._relations(classes, logits, stream)
         return ChainState(classes, self._room, logits, r)

@@ -43,6 +43,11 @@ _SPREAD, _SHIFT = 2654435761, 16
 # Number of float32 in a vector register. Rows of whole registers are faster.
 _VECTOR: Final = 8
 
+MOST_PAIRS: Final = 65_536
+"""Maximum number of pairs of classes in one computation: those of 256 classes."""
+# Maximum number of candidates in one computation.
+_MOST_MEANS: Final = 256
+
 # Maximum variance of a logit, averaged over units, that `_directions` may neglect. Neglecting a
 # variance changes a probability by about 1/20 of this variance. The model `places-triway` keeps 6
 # of 33 directions.
@@ -179,8 +184,26 @@ class RelationUnits(ABC):
         """Return the log-odds of relations between absent candidate classes and anchor classes.
 
         The candidate is the subject in the first result, the anchor in the second. Each candidate
-        counts as present. `anchors` are positions among the classes of the scene.
+        counts as present. `anchors` are positions among the classes of the scene. The computation
+        in blocks of candidates bounds the memory.
         """
+        m = len(anchors)
+        size = min(_MOST_MEANS, max(1, MOST_PAIRS // (2 * m)))
+        blocks = [
+            self._of_candidates(scene, candidates[start : start + size], anchors, only)
+            for start in range(0, max(len(candidates), 1), size)
+        ]
+        log_odds = np.concatenate(blocks) if len(blocks) > 1 else blocks[0]
+        return log_odds[:, :, :m], log_odds[:, :, m:]
+
+    def _of_candidates(
+        self,
+        scene: EncodedScene,
+        candidates: Int[NDArray, " N"],
+        anchors: Int[NDArray, " m"],
+        only: int | None,
+    ) -> Float[NDArray, "N R 2*m"]:
+        """Return the log-odds of `placement_log_odds`, with the candidates as subjects first."""
         N, m = len(candidates), len(anchors)
         # Classes 0 to N - 1 of the pairs are the candidates, and the next m are the anchors.
         i, j = np.empty((N, 2 * m), np.int64), np.empty((N, 2 * m), np.int64)
@@ -194,8 +217,7 @@ class RelationUnits(ABC):
         )
         means = state_means(scene.x + self._W[candidates], self._states)
         chosen = self._all if only is None else slice(only, only + 1)
-        log_odds = to_log_odds(*self.moments(means, pairs, chosen))
-        return log_odds[:, :, :m], log_odds[:, :, m:]
+        return to_log_odds(*self.moments(means, pairs, chosen))
 
 
 class FreeUnits(RelationUnits):

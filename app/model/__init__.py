@@ -20,11 +20,12 @@ from app.model.calibration import (
     WhereFit,
 )
 from app.model.possibility import Possibility
-from app.model.scene_model import SceneModel
+from app.model.scene_model import SceneModel, derived_bytes
 from app.model.statistics import Counts, Offsets, Places
 
 __all__ = [
     "AlarmLine", "AlarmLines", "Calibration", "CountSlope", "Counts", "CoverageFit", "FitLimit",
     "Judgement", "LabelFit", "Misplaced", "Offsets", "PlaceFit", "Places", "Possibility",
     "RealFit", "SceneModel", "Sensitivity", "Sharpness", "WhereFit",
+    "derived_bytes",
 ]  # fmt: skip

@@ -25,6 +25,8 @@ from app.scene.vocabulary import Vocabulary, Word
 
 _MOST_KEPT: Final = 4  # models with words that a model keeps, of about 20 MB each
 
+_MOST_LISTED: Final = 256  # classes of a scene, and candidates of one computation
+
 RARELY: Final = 1 / 500
 """A class is rarely shown if a smaller share of the training scenes shows it."""
 
@@ -36,6 +38,22 @@ _HIGHEST_SEAT: Final = 0.8  # maximum height of a seat, as a share of the height
 # Maximum median spread of the heights of things, as a share of the height of the furniture. Things
 # in furniture with several shelves have a larger spread.
 _SEAT_SPREAD: Final = 0.28
+
+
+def derived_bytes(spec: MachineSpec) -> int:
+    """Return a bound of the bytes in arrays whose size is a product of two sizes of a machine.
+
+    Answers derive these arrays from the weights, which may be much smaller. The bound includes
+    temporary arrays of one request.
+    """
+    V, H1, C, K, A, listed = spec.V, spec.H1, spec.C, spec.K, spec.A, _MOST_LISTED
+    # The kernel of `RowMap`, `ObjectScorer.increases`, `Vocabulary.related`, and models with words.
+    of_classes = (16 + 8 + 4 + 6 * _MOST_KEPT) * V * V + 32 * V * C
+    of_samples = spec.N * (5 * V + 32 * H1 + 16 * listed)
+    # The products of two directions of `SharedUnits`, and the factors of all pairs.
+    of_pairs = A * (K + 1) ** 2 * (8 * H1 + 2 * listed)
+    of_pairs += 4 * K * listed * (A * spec.units + 2 * listed)
+    return of_classes + of_samples + of_pairs + 40 * H1 * H1 + 24 * listed * C * (1 + spec.profiles)
 
 
 class RoomEvidence(NamedTuple):

@@ -23,8 +23,14 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from app.compiling import compiled
-from app.errors import LocatedError, RareRoomTypeError
-from app.inference.chains import ChainState, ConditionedChains, Conditions, random_stream
+from app.errors import AnswerTooLargeError, LocatedError, RareRoomTypeError
+from app.inference.chains import (
+    ChainState,
+    ConditionedChains,
+    Conditions,
+    CrowdedSceneError,
+    random_stream,
+)
 from app.inference.relation_units import encode
 from app.model.possibility import IN, ON, known_share
 from app.model.scene_model import SceneModel
@@ -77,6 +83,9 @@ def generate(
         `ConditionedChains.log_score`. Only scores of the same model, for the same listed classes
         and profile, can be compared.
 
+    Raises:
+        AnswerTooLargeError: a drawn scene has too many classes.
+
     Example:
         >>> scene = Scene(model.vocabulary.bare_objects(["desk"]))
         >>> "desk" in generate(model, scene, seed=1)["scenes"][0]["objects"]
@@ -92,7 +101,10 @@ def generate(
     scenes: list[Fields] = []
     while len(scenes) < count and not stop():
         stream = random_stream(seed, len(scenes))
-        state = draw_plausible(model, chains, scene, steps, stream, stop)
+        try:
+            state = draw_plausible(model, chains, scene, steps, stream, stop)
+        except CrowdedSceneError as error:
+            raise AnswerTooLargeError([LocatedError(("temperature",), str(error))]) from None
         scenes.append(_scene(model, chains, state, shown[state.classes], evidence))
     fields: Fields = {"seed": seed, "scenes": scenes}
     if listed_as := _words(model, scene, listing):

@@ -62,12 +62,13 @@ def new_labels(
     objects: Sequence[str | Detection],
     vocabulary: Vocabulary,
 ) -> int:
-    """Return how many labels of objects and candidates need a search, which takes up to 1 ms.
+    """Return how many labels of objects, candidates and rooms need a search, of up to 1 ms each.
 
     A label that is read by its meaning counts each time, and as `MAX_SUGGESTED` labels, because the
     model then needs predicted weights.
     """
     searches = _SEARCHES[request.unknown_labels]
+    by_name = tuple(search for search in searches if search != "meaning")  # also of room types
     new = 0
     for entry in objects:
         if isinstance(entry, str):
@@ -80,8 +81,14 @@ def new_labels(
     candidates: Sequence[str] = getattr(request, "candidates", None) or ()
     if isinstance(request, WhereRequest):
         candidates = [request.label]
+        for room in request.rooms:
+            # The id of a room may name its type.
+            name, tried = room.room_type, by_name
+            if name is None:
+                name, tried = room.id, ("read",)
+            new += not vocabulary.remembers(name, tried, is_room=True)
     if is_room:
-        searches = tuple(search for search in searches if search != "meaning")
+        searches = by_name
     new += sum(not vocabulary.remembers(label, searches, is_room=is_room) for label in candidates)
     return new * (MAX_SUGGESTED if "meaning" in searches else 1)
 

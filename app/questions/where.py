@@ -46,7 +46,7 @@ from app.questions.question import Example, Options, Question
 from app.questions.reading import Reading
 from app.scene.scene import Scene
 from scene_client.frames import Axes, is_world_fixed, viewer_axes
-from scene_client.schemas import MAX_THINGS, HomeRoom, SceneRequest, WhereAnswer, WhereRequest
+from scene_client.schemas import HomeRoom, SceneRequest, WhereAnswer, WhereRequest
 
 LOOK: Final = 0.8
 """Probability that a robot that sees the place of a thing detects the thing."""
@@ -238,12 +238,9 @@ def rooms_of(request: WhereRequest) -> list[SceneRequest]:
     """Return each room of a request as a scene, without its type.
 
     Raises:
-        InvalidRequestError: the rooms have too many objects, or two of them have the same id.
+        InvalidRequestError: two rooms have the same id.
     """
     errors = ErrorList()
-    if sum(len(room.objects) for room in request.rooms) > MAX_THINGS:
-        message = f"the rooms must have at most {MAX_THINGS} objects together"
-        errors.add(InvalidRequestError, ("rooms",), message)
     used: set[str] = set()
     for k, room in enumerate(request.rooms):
         if room.id in used:

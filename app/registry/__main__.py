@@ -42,7 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _existing(root: str) -> Store:
-    if not Path(root).is_dir():  # `Store` would create it
+    if not Path(root).is_dir():
         raise StoreError("unreadable", f"there is no folder {root}")
     return Store(root)
 

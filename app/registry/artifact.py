@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from app.inference import MachineSpec, Weights
 from app.inference.objects import LARGEST_WEIGHT
 from app.inference.weights import layout
-from app.model import Counts, Offsets, Places, Possibility, SceneModel
+from app.model import Counts, Offsets, Places, Possibility, SceneModel, derived_bytes
 from app.registry.card import render_card
 from app.registry.description import Description
 from app.registry.durable import read_file, sync_directory, write_file
@@ -31,6 +31,8 @@ MAX_MANIFEST_BYTES: Final = 4 * 2**20
 MAX_CARD_BYTES: Final = 2**20
 MAX_WEIGHTS_BYTES: Final = 2**30
 """Default maximum size of the weights file in bytes."""
+MAX_DERIVED_BYTES: Final = 2**29
+"""Maximum of `derived_bytes`. A shipped model of 1,582 classes has 210 MB."""
 
 _DTYPES: Final = {float: "float32", int: "int32"}
 
@@ -169,6 +171,10 @@ def _weights(manifest: Manifest, tensors: Mapping[str, NDArray[Any]]) -> Weights
         "the artifact has",
         f"but a {spec.variant} machine of this spec needs",
     )
+    if (derived := derived_bytes(spec)) > MAX_DERIVED_BYTES:
+        most = f"more than the maximum of {MAX_DERIVED_BYTES} bytes"
+        reason = f"answers of a machine of these sizes need arrays of {derived} bytes, {most}"
+        raise ArtifactError("too_large", reason)
     try:
         weights = Weights(spec, tensors)
     except ValueError as error:

@@ -55,7 +55,7 @@ StoreState: TypeAlias = tuple[tuple[str | int, ...], ...]
 
 
 class Store:
-    """A directory of published models. The first publication creates it."""
+    """A directory of published models. Only `publish` creates it."""
 
     def __init__(
         self,
@@ -178,7 +178,7 @@ class Store:
         def write(folder: Path) -> None:
             write_artifact(folder, description, state, storage_dtype=storage_dtype)
 
-        with self._writing():
+        with self._writing(creates=True):
             return self._add(description.name, description.version, write)
 
     def copy(self, source: "Store", name: str, version: str) -> bool:
@@ -271,10 +271,11 @@ class Store:
         replace_file(self.root / ALIASES, text, prefix=TEMPORARY)
 
     @contextmanager
-    def _writing(self) -> Iterator[None]:
+    def _writing(self, *, creates: bool = False) -> Iterator[None]:
         """Hold the lock of the store, and remove temporary files of crashed writers."""
         try:
-            make_directory(self.root)
+            if creates:
+                make_directory(self.root)
             with exclusive(self.root / _LOCK, self._lock_timeout):
                 self._clear_leftovers()
                 yield

@@ -31,6 +31,7 @@ _TIGHT: Final = 1.2  # ratio of extents up to which a box fits into another box
 _MOST_REMEMBERED: Final = 4096  # results of searches
 _LONGEST: Final = 100  # characters of a remembered label, the maximum in a request
 _MOST_GUESSED: Final = 3  # alternatives of a label
+_MOST_BROADER: Final = 16  # broader classes of a class; shipped classes have up to 4
 
 
 class Word(NamedTuple):
@@ -102,8 +103,8 @@ class Vocabulary:
 
     Raises:
         ValueError: the list of classes is empty, a name is empty, a key of `room_aliases` is not a
-            room type, a parent is not a class or its own ancestor, or two classes, or two room
-            types, have names with the same `label_key`.
+            room type, a parent is not a class or its own ancestor, a class has too many broader
+            classes, or two classes, or two room types, have names with the same `label_key`.
     """
 
     objects: Sequence[ObjectClass]
@@ -143,10 +144,13 @@ class Vocabulary:
                 parents[index] = parent
         # Each pass goes one parent up. In a circle, a class becomes its own ancestor.
         ancestors = parents.copy()
-        while (ancestors >= 0).any():
+        for _ in range(_MOST_BROADER):
             if (own := np.flatnonzero(ancestors == np.arange(len(ancestors)))).size:
                 raise ValueError(f"{self.objects[own[0]].label!r} is its own ancestor")
             ancestors = np.where(ancestors < 0, -1, parents[ancestors])
+        if (deep := np.flatnonzero(ancestors >= 0)).size:
+            label = self.objects[deep[0]].label
+            raise ValueError(f"{label!r} has more than {_MOST_BROADER} broader classes")
         return _read_only(parents)
 
     def __len__(self) -> int:

@@ -192,6 +192,9 @@ def warm_up(artifact: Artifact) -> None:
         for question in QUESTIONS:
             for answer in question.warm_up(model, (related, bare, posed)):
                 written(answer)
+    except errors.RequestError as error:
+        reason = "; ".join(one.message for one in error.located)
+        raise ArtifactError("warm_up_failed", reason) from None
     except Exception:
         # A broken model may raise any exception. The service must still serve other models.
         _logger.exception("the warm-up of model %s failed", "@".join(artifact.key))

@@ -38,6 +38,9 @@ JSON = {"Content-Type": "application/json"}
         ("relations", "pairs", [], 4096),
         ("outliers", "relations", 7, 65536),
         ("outliers/batch", "scenes", {}, 256),
+        ("where", "rooms", {}, 32),
+        ("where", "searched", 7, 1024),
+        ("where/batch", "scenes", {}, 256),
     ],
 )
 async def test_entries_are_counted_before_validation(client, path, field, entry, most):

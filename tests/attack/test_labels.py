@@ -2,69 +2,120 @@
 
 import ast
 import importlib
-import pkgutil
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from itertools import product
 from pathlib import Path
 from time import thread_time_ns
 from types import FrameType
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import pytest
 from httpx import AsyncClient
 
 import app
-import scene_client
 from app.api.questions import QUICK_LABELS, is_quick
 from app.errors import RequestError
 from app.questions.reading import Limits, read_scene
 from app.scene.labels import label_key
 from app.scene.nearest import NameIndex
 from app.scene.vocabulary import Vocabulary
-from scene_client.records import FIELDS, TABLE
+from scene_client import parsing
+from scene_client.records import FORMATS, TABLE
 from scene_client.schemas import MissingRequest, RoomsRequest
 from scene_client.schemas.requests import MAX_LABEL
 from tests.http.stores import VOCABULARY
 from tests.http.test_problems import problem
 
 METHODS: Final = ("match", "fullmatch", "search", "split", "sub", "findall", "finditer")
-# The service cuts these texts before the pattern reads them.
+# The length of these texts is bounded before the pattern reads them.
 BOUNDED: Final = {"app.settings._SERVICE_LINK"}
 LENGTH: Final = 400
+ROOT: Final = Path(app.__file__).parents[1]
+# Patterns of pydantic: its engine takes linear time.
+SOURCES: Final = [
+    file
+    for folder in ("app", "training", "clients")
+    for file in sorted((ROOT / folder).rglob("*.py"))
+    if not {".venv", "build"} & {*file.parts}
+]
+
+Found: TypeAlias = tuple[str, re.Pattern[Any], str]
 
 
-def patterns() -> Iterator[tuple[str, re.Pattern[Any], str]]:
-    """Yield place, pattern and method of the patterns in the source code of service and client."""
-    for package in (app, scene_client):
-        for info in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-            if not info.name.endswith("__main__"):
-                yield from _patterns_of(importlib.import_module(info.name))
-
+def patterns() -> Iterator[Found]:
+    """Yield place, pattern and method of all patterns of the service, the clients and training."""
+    for file in SOURCES:
+        yield from _patterns_of(file)
     for form in (*TABLE["lines"], *TABLE["refused"]):
         for name in {"match", "drop"} & form.keys():
             yield f"formats.json:{form['name']}", re.compile(form[name]), "fullmatch"
-    for name in FIELDS["scene"]:
-        yield "formats.json:scene", re.compile(name), "fullmatch"
+    for form in TABLE["refused"]:
+        start = re.compile(f"{parsing._BEFORE}(?:{form['match']})")
+        yield f"start of a file:{form['name']}", start, "match"
+    for form in FORMATS:
+        for pattern in _in_fields(form):
+            yield f"formats.json:{form['name']}", re.compile(pattern), "search"
 
 
-def _patterns_of(module: Any) -> Iterator[tuple[str, re.Pattern[Any], str]]:
-    nodes = list(ast.walk(ast.parse(Path(module.__file__).read_text())))
-    calls = [node.func for node in nodes if isinstance(node, ast.Call)]
-    used = {(ast.unparse(f.value), f.attr) for f in calls if isinstance(f, ast.Attribute)}
-    for name, value in vars(module).items():
-        pattern = value if isinstance(value, re.Pattern) else getattr(value, "pattern", None)
-        if isinstance(pattern, re.Pattern):
-            # A pattern that is an argument of a function starts at the first character.
-            methods = {m for n, m in used if n == name and m in METHODS} or {"match", "fullmatch"}
-            yield from ((f"{module.__name__}.{name}", pattern, m) for m in sorted(methods))
-    for node in nodes:
-        if isinstance(node, ast.Call) and ast.unparse(node.func) in {f"re.{m}" for m in METHODS}:
-            text = ", ".join(ast.unparse(one) for one in (node.args[0], *node.args[2:]))
-            pattern = eval(f"re.compile({text})", vars(module))
-            yield f"{module.__name__}:{node.lineno}", pattern, ast.unparse(node.func)[3:]
+def _in_fields(spec: Any) -> Iterator[str]:
+    """Yield the patterns of the fields of a format."""
+    if isinstance(spec, dict) and "path" in spec and "match" in spec:
+        yield spec["match"]
+    parts = spec.values() if isinstance(spec, dict) else spec if isinstance(spec, list) else ()
+    for part in parts:
+        yield from _in_fields(part)
+
+
+def _patterns_of(file: Path) -> Iterator[Found]:
+    """Yield the patterns in the source of a module, and those of its tables."""
+    tree = ast.parse(source := file.read_text("utf-8"))
+    if not re.search(r"\bre\.|\bpattern\b", source):
+        return
+    name, values = file.relative_to(ROOT).as_posix(), {"re": re}
+    if not name.startswith("clients/ros2"):  # its modules need ROS 2
+        dotted = name.removeprefix("clients/python/").removesuffix(".py").replace("/", ".")
+        values = vars(importlib.import_module(dotted))
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    attributes = [call.func for call in calls if isinstance(call.func, ast.Attribute)]
+    used = {(ast.unparse(one.value), one.attr) for one in attributes}
+    found = set[re.Pattern[Any]]()
+    for place, pattern, default in _compiled(values):
+        found.add(pattern)
+        of_place = {m for n, m in used if n.partition("[")[0] == place and m in METHODS}
+        for method in sorted(of_place or default):
+            yield f"{name}:{place}", pattern, method
+    for call in calls:
+        module, _, method = ast.unparse(call.func).rpartition(".")
+        if module != "re" or method not in (*METHODS, "compile"):
+            continue
+        position = {"compile": 1, "sub": 4, "split": 3}.get(method, 2)
+        flags = [one.value for one in call.keywords if one.arg == "flags"]
+        text = ", ".join(map(ast.unparse, (call.args[0], *call.args[position:], *flags)))
+        try:
+            pattern = eval(f"re.compile({text})", {**values, "re": re})
+        except (NameError, TypeError):  # the pattern of a table, such as `parsing._MEMBERS`
+            assert found, f"{name}:{call.lineno}"
+            continue
+        if method != "compile":
+            yield f"{name}:{call.lineno}", pattern, method
+        elif pattern not in found:
+            yield from ((f"{name}:{call.lineno}", pattern, m) for m in ("fullmatch", "search"))
+
+
+def _compiled(values: dict[str, Any]) -> Iterator[tuple[str, re.Pattern[Any], Sequence[str]]]:
+    """Yield name, pattern and usual methods of the patterns of a module, also in its tables."""
+    for name, value in values.items():
+        # A pattern that is an argument of a function starts at the first character.
+        alone = getattr(value, "pattern", None) if not isinstance(value, re.Pattern) else value
+        if isinstance(alone, re.Pattern):
+            yield name, alone, ("fullmatch", "match")
+        parts = value.values() if isinstance(value, dict) else value
+        for one in parts if isinstance(value, dict | list | tuple) else ():
+            if isinstance(one, re.Pattern):
+                yield name, one, ("fullmatch",)
 
 
 PATTERNS: Final = list({(one, m): (place, one, m) for place, one, m in patterns()}.values())
@@ -84,7 +135,10 @@ def worst_texts(pattern: re.Pattern[Any]) -> Iterator[tuple[str, str, str]]:
     """Yield start, unit and end of texts that make the pattern try many ways, and fail."""
     letters = characters(pattern)
     units = ("".join(unit) for size in (1, 2, 3) for unit in product(letters, repeat=size))
-    yield from product(("", "a", "the ", "- a"), (*units, "a(b)"), ("!", "\n", "a"))
+    # A character that a class excludes makes a long match fail at its end.
+    source = pattern.pattern if isinstance(pattern.pattern, str) else pattern.pattern.decode()
+    ends = {"!", "\n", "a", *re.findall(r"\[\^([^\\\w])", source)}
+    yield from product(("", "a", "the ", "- a"), (*units, "a(b)"), sorted(ends))
 
 
 def nanoseconds(run: Callable[[], Any], repeats: int) -> int:

@@ -199,7 +199,7 @@ def _with_sources(path: Path, sources: Sequence[str], written: int) -> str:
         expected["data"]["written"] = written
         array += f"\nwritten = {written}"
     text = re.sub(
-        r"^(\s*sources\s*=\s*)\[[^\]]*\]",
+        r"^([ \t]*sources[ \t]*=[ \t]*)\[[^\[\]]*\]",
         lambda match: match[1] + array,
         path.read_text("utf-8"),
         count=1,

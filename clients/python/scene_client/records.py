@@ -39,6 +39,7 @@ _CARRIES: Final[list[str]] = FIELDS["carries"]  # parts of the names of decisive
 _MOST_NAMES: Final = 8  # of unread fields in a note
 _MOST_RECORDS: Final = 4 * MAX_OBJECTS  # some have no label
 _TURN: Final = 6.3  # radians; a larger yaw is in degrees
+_LONGEST_TEXT: Final = 256  # characters of a text in which a pattern finds a field
 
 
 class Rows(list[dict[str, Any]]):
@@ -66,6 +67,8 @@ def spot(chain: Chain, spec: Any) -> Any:
         value = get(chain, spec["path"])
         if "match" not in spec or not isinstance(value, str):
             return value
+        if len(value) > _LONGEST_TEXT:
+            return None
         found = pattern(spec["match"]).search(value)
         return found[1] if found else None
     if "," not in spec:

@@ -42,7 +42,9 @@ class MissingRequest(SceneRequest):
     scenes the best answers"""
     top_k: Annotated[int, Field(ge=1)] = 10
     """maximum number of classes in the answer"""
-    candidates: Annotated[list[Label] | None, Field(min_length=1, max_length=4096)] = None
+    candidates: Annotated[
+        list[Label] | None, Field(min_length=1, max_length=4096, fail_fast=True)
+    ] = None
     """limit the answer to classes with these labels. The list `more` then contains them at any
     probability"""
     at: Annotated[Anchor, OrArray()] | None = None

@@ -24,7 +24,9 @@ class RoomsRequest(SceneRequest):
     objects: SomeObjects
     top_k: Annotated[int, Field(ge=1, le=4096)] = 5
     """maximum number of room types in the answer"""
-    candidates: Annotated[list[Label] | None, Field(min_length=1, max_length=4096)] = None
+    candidates: Annotated[
+        list[Label] | None, Field(min_length=1, max_length=4096, fail_fast=True)
+    ] = None
     """the possible room types, such as the rooms of a flat. Their probabilities sum to one. Names
     of one room type share one entry of the answer"""
     detail: Detail = "full"

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import Field, field_validator
+from pydantic_core import PydanticCustomError
 from typing_extensions import TypedDict
 
 from scene_client.frames import BoxOrigin, Extents, QuaternionOrder, Units, Up
@@ -60,9 +61,9 @@ class WhereRequest(Request):
 
     label: Label
     """label of the wanted thing"""
-    rooms: Annotated[list[HomeRoom], Field(min_length=1, max_length=MAX_ROOMS)]
+    rooms: Annotated[list[HomeRoom], Field(min_length=1, max_length=MAX_ROOMS, fail_fast=True)]
     """the rooms of the home, at most 32, with at most 1,024 objects together"""
-    searched: Annotated[list[Searched], Field(max_length=MAX_THINGS)] = []
+    searched: Annotated[list[Searched], Field(max_length=MAX_THINGS, fail_fast=True)] = []
     """places where the robot has looked for the thing without success"""
     top_k: Annotated[int, Field(ge=1, le=4096)] = 20
     """maximum number of places in the answer"""
@@ -85,6 +86,20 @@ class WhereRequest(Request):
     unknown_labels: UnknownLabels = "error"
     """treatment of labels that the model does not know, as in the requests about one scene. The
     `label` itself must be known, or be read by its spelling or its meaning"""
+
+    @field_validator("rooms", mode="before")
+    @classmethod
+    def _count_objects(cls, rooms: Any) -> Any:
+        """Refuse too many objects before their validation, which takes most of the time."""
+        total = 0
+        for room in rooms if isinstance(rooms, list) else ():
+            listed = room.get("objects") if isinstance(room, dict) else None
+            listed = room.objects if isinstance(room, HomeRoom) else listed
+            total += len(listed) if isinstance(listed, list) else 0
+        if total > MAX_THINGS:
+            message = f"the rooms must have at most {MAX_THINGS} objects together"
+            raise PydanticCustomError("too_many_objects", message)
+        return rooms
 
 
 class Spot(Reply):
