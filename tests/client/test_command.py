@@ -142,7 +142,8 @@ def test_the_table_of_places(scene: Any, peer: Any) -> None:
     body = ANSWERED | {"label": "soap", "listed_as": "Soaps", "rooms": [share]}
     body |= {"places": SPOTS, "not_here": 0.15}
     started = peer(answering(json.dumps(body).encode()))
-    done = scene("where", "Soaps", "-", "--url", started.url, stdin='{"bathroom": []}')
+    home = json.dumps({"bathroom": ["tub", {"id": "sink_1", "label": "sink"}]})
+    done = scene("where", "Soaps", "-", "--url", started.url, stdin=home)
     lines = [line.strip() for line in done.stdout.splitlines()]
     assert lines[0] == "Soaps (soap)"
     # The last place is unlikely, and the answer leaves further places out.
@@ -153,6 +154,16 @@ def test_the_table_of_places(scene: Any, peer: Any) -> None:
         "at another place 0.050",
         "not here 0.150",
     ]
+
+
+def test_ids_without_a_meaning_have_their_label(scene: Any, peer: Any) -> None:
+    """The ids of a `Home` are numbers of tracks."""
+    spot = {"room": "bathroom", "probability": 0.5, "relation": "on-top", "object": "t12"}
+    body = ANSWERED | {"label": "soap", "places": [spot], "rooms": [], "not_here": 0.5}
+    started = peer(answering(json.dumps(body).encode()))
+    rooms = {"hall": [{"id": "t12", "label": "bed"}], "bathroom": [{"id": "t12", "label": "sink"}]}
+    done = scene("where", "soap", "-", "--url", started.url, stdin=json.dumps(rooms))
+    assert "bathroom: on top of sink (t12)" in done.stdout
 
 
 def test_outliers_show_doubt_and_several_rooms(scene: Any, peer: Any) -> None:

@@ -400,7 +400,8 @@ def where(
     fields |= general.conventions | _named(top_k=top_k, unknown_labels=unknown_labels)
     if places:
         fields["searched"] = [*fields.get("searched", ()), *places]
-    _show(context, lambda client: client.where(label, **fields), tables.where)
+    shown = partial(tables.where, rooms=fields["rooms"])
+    _show(context, lambda client: client.where(label, **fields), shown)
 
 
 # ------------------------------------------------------------------------------------- models
@@ -429,7 +430,10 @@ def ready(context: typer.Context) -> None:
 # ------------------------------------------------------------------------------------ planners
 
 
-@app.command()
+@app.command(
+    epilog="General options, before or after mcp: --url ADDRESS, --model NAME (default: the "
+    "service's default), --offline STORE, --timeout SECONDS. See also scene --help."
+)
 def mcp(
     context: typer.Context,
     http: Annotated[

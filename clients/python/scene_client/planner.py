@@ -209,8 +209,9 @@ class LocateObject(Tool):
             {"id": name, "room_type": name, "objects": objects}
             for name, objects in fields["rooms"].items()
         ]
-        found = client.where(**fields)
-        return sentences.text(found, sentences.where(found), rooms=self.rooms)
+        found, labels = client.where(**fields), phrases.labels_in(fields["rooms"])
+        said = sentences.where(found, labels, self.searched or ())
+        return sentences.text(found, said, rooms=self.rooms)
 
 
 class IdentifyRoom(Tool):
