@@ -121,6 +121,10 @@ class AnswerError(ClientError):
     """The client cannot read the answer of the service."""
 
 
+class UnknownThingError(ClientError, LookupError):
+    """A home has no thing with this id, for example because the thing is gone."""
+
+
 class HomeFileError(ClientError, ValueError):
     """The file of a home is damaged, or a newer client has written it. It is left as it is."""
 

@@ -6,7 +6,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -16,7 +16,7 @@ from pydantic import TypeAdapter
 from scene_client import schemas
 from scene_client.errors import HomeFileError
 from scene_client.home_settings import Latch
-from scene_client.tracks import Point, Track, Vector
+from scene_client.tracks import Track, Vector
 
 FORMAT: Final = "scene-home"
 VERSION: Final = 1  # of the file
@@ -25,8 +25,9 @@ MOST_THINGS, MOST_ROOMS = 256, schemas.MAX_ROOMS  # of a room in a request, and 
 HEADINGS, LOOKS = 8, 30  # directions, or looks without poses, that show a whole room
 
 Kind = Literal[
-    "appeared", "gone", "out-of-place", "misplaced", "misdetection", "cleared", "room", "service"
-]
+    "appeared", "gone", "relabelled", "out-of-place", "misplaced", "misdetection", "cleared",
+    "room", "service",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class Event:
     label: str | None = None  # of the thing; type of the room; service `lost` or `back`
     room: str = ""  # name of the room; empty without names
     probability: float | None = None  # in the last answer
-    detail: str | None = None  # the former alarm or type; the error of the service
+    detail: str | None = None  # the former alarm, label or type; the error of the service
 
 
 @dataclass
@@ -71,12 +72,31 @@ class Room:
         return name if self.is_named else self.type.value
 
 
-def pose_of(values: Sequence[float] | Mapping[str, float] | None) -> Vector | None:
-    """Return x, y and yaw; None if the robot is not located."""
-    if values is None:
-        return None
-    x, y, yaw = [values[n] for n in ("x", "y", "yaw")] if isinstance(values, Mapping) else values
-    return (float(x), float(y), float(yaw)) if all(map(math.isfinite, (x, y, yaw))) else None
+class Asked:
+    """What the last question about each room was about. `step` is the least change of a thing."""
+
+    def __init__(self, step: float) -> None:
+        self.step = step
+        self._things: dict[str, dict[str, tuple[str, float, Vector | None]]] = {}
+
+    def differs(self, room: str, things: Sequence[Track]) -> bool:
+        """Return whether the things of a room have changed since the last question."""
+        asked = self._things.get(room, {})
+        if asked.keys() != {one.id for one in things}:
+            return True
+        for one in things:
+            label, confidence, place = asked[one.id]
+            has_moved = place and one.place and math.dist(place, one.place) > self.step
+            if label != one.label or abs(confidence - one.confidence) > self.step or has_moved:
+                return True
+        return False
+
+    def remember(self, room: str, things: Iterable[Track]) -> None:
+        """Remember what a question is about. The verdicts of its answer follow."""
+        self._things[room] = {}
+        for one in things:
+            self._things[room][one.id] = (one.label, one.confidence, one.place)
+            one.verdict = None
 
 
 def seconds_of(stamp: float | schemas.Stamp | schemas.Body | None) -> float:
@@ -87,15 +107,6 @@ def seconds_of(stamp: float | schemas.Stamp | schemas.Body | None) -> float:
         return float(stamp)
     whole = schemas.Stamp.model_validate(stamp, from_attributes=True)
     return whole.sec + whole.nanosec * 1e-9
-
-
-def inside(x: float, y: float, polygon: Iterable[Point]) -> bool:
-    """Return whether a polygon contains a point (even-odd rule)."""
-    corners, odd = list(polygon), False
-    for (ax, ay), (bx, by) in zip(corners, corners[1:] + corners[:1], strict=True):
-        if (ay > y) != (by > y) and x < ax + (y - ay) * (bx - ax) / (by - ay):
-            odd = not odd
-    return odd
 
 
 @dataclass

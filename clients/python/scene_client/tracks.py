@@ -25,7 +25,7 @@ MEMORY: Final = 20.0  # looks after which the mean of a position forgets older l
 UNCONFIRMED: Final = 60.0  # seconds without a detection after which an unconfirmed track ends
 FARTHEST_JUMP: Final = 2.5  # of the map
 SIMILAR: Final = 1.3  # largest ratio of the diagonals of two boxes of one thing with two labels
-NOTABLE: Final = 0.2  # share of the votes from which another label is an alternative
+NOTABLE: Final = 0.2  # least share of the votes of a label that is no error of the detector
 BESIDE: Final = math.radians(45)  # between a thing and its neighbours in a frame without a view
 # Probability that a frame shows a thing: in a known view, between others, in the same room.
 FULL, POSES, LABELS = 1.0, 0.6, 0.25
@@ -83,6 +83,7 @@ class Track:
     yaw: float | None = None
     looked: float | None = None  # time of the last look, with or without a detection
     judged: float | None = None  # time of the last step of the alarm
+    named: str | None = None  # label in the last event about it
     looks: float = 0.0  # number of looks with a detection
     missed: float = 0.0  # number of looks without one, since the last detection
     is_confirmed: bool = False
@@ -103,7 +104,15 @@ class Track:
     @property
     def confidence(self) -> float:
         """Probability that the thing exists and has its label."""
-        return self.exists * self.share(self.label)
+        return self.exists * self.labels[self.label]
+
+    @property
+    def labels(self) -> dict[str, float]:
+        """Probabilities of the labels, if the thing exists. Rare votes count as errors."""
+        # One swapped label in ten looks must not make the service doubt the other nine.
+        label, shares = self.label, {one: self.share(one) for one in self.votes}
+        notable = {k: share for k, share in shares.items() if share >= NOTABLE or k == label}
+        return {one: share / sum(notable.values()) for one, share in notable.items()}
 
     def share(self, label: str) -> float:
         """Return the share of a label in the votes."""
@@ -130,10 +139,10 @@ class Track:
         label = self.label
         thing: dict[str, Any] = {"id": self.id, "label": label}
         thing["confidence"] = max(0.01, round(self.confidence, 3))
-        others = [(self.share(one), one) for one in self.votes if one != label]
-        if others and (second := max(others))[0] >= NOTABLE:
-            share = max(0.01, round(self.exists * second[0], 3))
-            thing["alternatives"] = [{"label": second[1], "confidence": share}]
+        if others := [(share, one) for one, share in self.labels.items() if one != label]:
+            share, second = max(others)
+            share = max(0.01, round(self.exists * share, 3))
+            thing["alternatives"] = [{"label": second, "confidence": share}]
         if self.place is not None:
             thing["position"] = [round(value, 3) for value in plus(self.place, shift)]
         if self.size is not None:
