@@ -26,11 +26,12 @@ RUN /opt/venv/bin/python -m pip uninstall --yes -q pip setuptools \
 FROM packages AS training-packages
 # The index for CPU builds of torch; without it the default index may bring a CUDA build.
 ARG TORCH_INDEX_URL=""
-COPY requirements-training.lock requirements-torch.lock ./
+COPY requirements-training.lock requirements-torch.lock requirements-torch-cpu.lock ./
 RUN /opt/venv/bin/python -m pip install --no-cache-dir --disable-pip-version-check -q \
         --require-hashes -r requirements-training.lock \
     && /opt/venv/bin/python -m pip install --no-cache-dir --disable-pip-version-check -q \
-        ${TORCH_INDEX_URL:+--no-deps --index-url "$TORCH_INDEX_URL"} -r requirements-torch.lock
+        ${TORCH_INDEX_URL:+--no-deps --require-hashes --index-url "$TORCH_INDEX_URL"} \
+        -r requirements-torch${TORCH_INDEX_URL:+-cpu}.lock
 
 # ---- training: docker run ... train --help
 FROM base AS train
@@ -93,14 +94,15 @@ ENV HOME=/tmp \
     NUMBA_CACHE_DIR=/tmp/compiled \
     SCENE_HOST=0.0.0.0 \
     SCENE_PORT=8000 \
+    SCENE_HEALTH_PORT=8081 \
     SCENE_STORE=/srv/scene/model_store
 USER 10001:10001
 LABEL org.opencontainers.image.title=scene-boltzmann \
     org.opencontainers.image.version=2.0.0 \
     org.opencontainers.image.licenses=Apache-2.0
-EXPOSE 8000
+EXPOSE 8000 8081
 # http.client, unlike urlopen, never takes a proxy that the environment names.
 HEALTHCHECK --interval=10s --timeout=3s --start-period=60s --retries=3 \
-    CMD ["python", "-c", "import http.client, os, sys; c = http.client.HTTPConnection('127.0.0.1', int(os.environ['SCENE_PORT']), timeout=2); c.request('GET', '/health/ready'); sys.exit(c.getresponse().status != 200)"]
+    CMD ["python", "-c", "import http.client, os, sys; c = http.client.HTTPConnection('127.0.0.1', int(os.environ['SCENE_HEALTH_PORT']), timeout=2); c.request('GET', '/health/ready'); sys.exit(c.getresponse().status != 200)"]
 # The compiler's cache must be writable, and /tmp alone is.
 CMD ["sh", "-c", "mkdir -p $NUMBA_CACHE_DIR && cp -R compiled/. $NUMBA_CACHE_DIR && exec python -m app"]

@@ -16,7 +16,8 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 # One worker more than cores, because the tests spend a third of their time waiting.
 WORKERS ?= $$(($$($(BIN)/python -c 'import os; print(os.cpu_count())') + 1))
 PYTEST := $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadscope --no-loadscope-reorder
-TORCH := -r requirements-torch.lock $(if $(TORCH_INDEX_URL),--index-url $(TORCH_INDEX_URL))
+TORCH := $(if $(TORCH_INDEX_URL),--require-hashes -r requirements-torch-cpu.lock --index-url $(TORCH_INDEX_URL),\
+	-r requirements-torch.lock)
 
 # Where this is set, every process of the tests compiles all sources again, for up to two seconds.
 unexport PYTHONDONTWRITEBYTECODE
@@ -49,7 +50,7 @@ define install
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: checks help run ray test test-fast test-slow coverage docs image audit setup training format bench lock clean
+.PHONY: checks help run ray test test-fast test-slow coverage docs image audit sbom setup training format bench lock clean
 .DELETE_ON_ERROR:
 
 help:  ## show this help
@@ -89,8 +90,11 @@ coverage: $(EVERYTHING)  ## measure which lines the tests run, without the slow 
 docs: $(EVERYTHING)  ## build the documentation as a site that works without internet (build/site)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 
-audit: $(EVERYTHING)  ## report known vulnerabilities and risky code, write bills of materials (build/)
+audit: $(EVERYTHING)  ## report known vulnerabilities and risky code
 	$(BIN)/python scripts/audit.py $(ARGS)
+
+sbom: $(EVERYTHING)  ## write bills of materials of the images' Python packages (CycloneDX, build/)
+	$(BIN)/python -m scripts.sbom
 
 image: $(BIN)/python  ## build the image, ask its service its questions, remove it (Docker or buildah)
 	$(BIN)/python deploy/image.py $(ARGS)
@@ -128,12 +132,12 @@ $(SERVICE): requirements.lock pyproject.toml clients/python/pyproject.toml | $(B
 	@echo "Compiled."
 	@touch $@
 
-$(TRAINING): requirements-training.lock requirements-torch.lock pyproject.toml clients/python/pyproject.toml | $(BIN)/python
+$(TRAINING): requirements-training.lock requirements-torch.lock requirements-torch-cpu.lock pyproject.toml clients/python/pyproject.toml | $(BIN)/python
 	@echo "Installing the packages of the service and of training into $(VENV) ..."
 	$(call install,requirements-training.lock)
 	@touch $(SERVICE) $@
 
-$(EVERYTHING): requirements-dev.lock requirements-torch.lock pyproject.toml clients/python/pyproject.toml | $(BIN)/python
+$(EVERYTHING): requirements-dev.lock requirements-torch.lock requirements-torch-cpu.lock pyproject.toml clients/python/pyproject.toml | $(BIN)/python
 	@echo "Installing every package into $(VENV) ..."
 	$(call install,requirements-dev.lock)
 	@touch $(SERVICE) $(TRAINING) $@

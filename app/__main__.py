@@ -111,35 +111,42 @@ def _bind(host: str, port: int, send_timeout: float) -> list[socket.socket]:
     return bound
 
 
-def _refuse_address(settings: "Settings", error: OSError) -> int:
+def _refuse_address(host: str, port: int, variable: str, error: OSError) -> int:
     """Print why the service cannot listen on its address; return the exit status."""
-    address = f"{settings.host}:{settings.port}"
+    address = f"{host}:{port}"
     if error.errno == errno.EADDRINUSE:
-        reason = f"SCENE_PORT: another program uses {address}; set SCENE_PORT to a free port"
+        reason = f"{variable}: another program uses {address}; set {variable} to a free port"
     else:
-        variable = "SCENE_PORT" if error.errno == errno.EACCES else "SCENE_HOST"
-        reason = f"{variable}: the service cannot listen on {address}: {error.strerror or error}"
+        cause = variable if error.errno == errno.EACCES else "SCENE_HOST"
+        reason = f"{cause}: the service cannot listen on {address}: {error.strerror or error}"
     sys.stderr.write(f"{reason}\n")
     return 3
 
 
 def serve(settings: "Settings", began: float) -> int:
     """Serve until the process is stopped. Return its exit status: 0, or 3 if it could not start."""
+    sockets, health = list[socket.socket](), list[socket.socket]()
+    variable, port = "SCENE_PORT", settings.port
     try:
-        sockets = _bind(settings.host, settings.port, settings.client_timeout)
+        sockets = _bind(settings.host, port, settings.client_timeout)
+        if settings.health_port is not None:
+            variable, port = "SCENE_HEALTH_PORT", settings.health_port
+            health = _bind(settings.host, port, settings.client_timeout)
+            for listener in health:
+                listener.listen()
     except OSError as error:
-        return _refuse_address(settings, error)
+        return _refuse_address(settings.host, port, variable, error)
     tune()
     from app.server import Server
 
-    server = Server(settings, began)
+    server = Server(settings, began, health)
     try:
         server.run(sockets)
     except OSError as error:
         # Two services that start together can both bind, but only one of them can listen.
         if server.started or error.errno != errno.EADDRINUSE:
             raise
-        return _refuse_address(settings, error)
+        return _refuse_address(settings.host, settings.port, "SCENE_PORT", error)
     return 0 if server.started else 3
 
 

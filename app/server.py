@@ -8,16 +8,20 @@ import os
 import signal
 import socket
 import struct
-from contextlib import suppress
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from time import monotonic
 from types import FrameType
-from typing import Final
+from typing import Any, Final
 
 import uvicorn
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 
+from app.api.health import HealthPort
 from app.errors import ServiceError
 from app.main import create_app
-from app.serving.logs import log_config
+from app.serving.logs import flush, log_config
 from app.serving.runtime import Runtime
 from app.settings import Settings, warnings
 
@@ -29,6 +33,33 @@ _SIOCGIFADDR: Final = 0x8915
 _logger = logging.getLogger("app.server")
 
 
+class Connection(HttpToolsProtocol):
+    """A connection that tells each pipelined request that the client has disconnected.
+
+    uvicorn tells only the last request. The request in progress would then fail at its answer,
+    because the connection is closed, and would count as a defect of the service.
+    """
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._unfinished: deque[RequestResponseCycle] = deque()
+
+    def on_headers_complete(self) -> None:
+        """Begin a request, or queue it behind the request in progress."""
+        super().on_headers_complete()
+        while self._unfinished and self._unfinished[0].response_complete:
+            self._unfinished.popleft()
+        self._unfinished.append(self.cycle)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Tell all requests that the client has disconnected."""
+        for request in self._unfinished:
+            request.disconnected = not request.response_complete
+            request.message_event.set()
+        self._unfinished.clear()
+        super().connection_lost(exc)
+
+
 class Server(uvicorn.Server):
     """A server that shuts down in three steps on SIGTERM.
 
@@ -38,15 +69,16 @@ class Server(uvicorn.Server):
     2. The server closes the listening socket.
     3. The server finishes the requests in progress.
 
-    ``began`` is `time.monotonic()` at the start of the process.
+    ``began`` is `time.monotonic()` at the start of the process. ``health`` are the sockets of the
+    port for health checks.
     """
 
-    def __init__(self, settings: Settings, began: float) -> None:
+    def __init__(self, settings: Settings, began: float, health: list[socket.socket]) -> None:
         app = create_app(settings)
         config = uvicorn.Config(
             app,
             root_path=settings.root_path,
-            http="httptools",
+            http=Connection,
             ws="none",
             limit_concurrency=settings.max_connections,
             # A proxy must close idle connections earlier. Otherwise it may send a request while the
@@ -64,6 +96,8 @@ class Server(uvicorn.Server):
         for warning in warnings():
             _logger.warning(warning)
         self._runtime: Runtime = app.state.runtime
+        self._health = HealthPort(self._runtime, health) if health else None
+        self._watching: asyncio.Task[None] | None = None
         self._settings = settings
         self._closing_at: float | None = None
         self._began = began
@@ -84,6 +118,8 @@ class Server(uvicorn.Server):
             self.started = False
             await self.lifespan.shutdown()
             raise
+        if self._health is not None:
+            self._watching = asyncio.create_task(self._health.watch())
         asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self._handle_hangup)
         self._log_addresses(sockets or [])
 
@@ -121,9 +157,19 @@ class Server(uvicorn.Server):
                 port,
             )
 
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Handle signals in the ``with`` block. After it, they end the process as usual."""
+        with super().capture_signals():
+            try:
+                yield
+            finally:
+                flush()
+
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Start the shutdown, or end its first step. During the start, end the process at once."""
         if not self.started:
+            flush()
             signal.signal(sig, signal.SIG_DFL)
             signal.raise_signal(sig)
         is_first, self._runtime.draining = not self._runtime.draining, True

@@ -127,6 +127,9 @@ class Settings(BaseSettings):
     """Address to listen on."""
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
     """Port to listen on; 0 = any free port."""
+    health_port: Annotated[int, Field(ge=1, le=65535)] | None = None
+    """Further port, which answers only health checks, however busy the service is; none by
+    default."""
     store: Path = Path("model_store")
     """Folder of published models."""
     store_poll: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] = 5
@@ -231,6 +234,13 @@ class Settings(BaseSettings):
             return _host(value)
         except ValueError:
             raise ValueError("SCENE_HOST must be a name or an IP address") from None
+
+    @field_validator("health_port")
+    @classmethod
+    def _check_health_port(cls, value: int | None, info: ValidationInfo) -> int | None:
+        if value is not None and value == info.data.get("port"):
+            raise ValueError("it must differ from SCENE_PORT")
+        return value
 
     @field_validator("allowed_hosts")
     @classmethod

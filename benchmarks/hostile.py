@@ -1,8 +1,9 @@
 """``python -m benchmarks.hostile``: a polite client, alone and beside a client that attacks.
 
-The polite client sends 50 questions per second. The attacker has another address and sends costly
-requests without pauses, from a process of its own. Windows with and without an attack alternate.
-The result of an attack is the p99 latency of the polite client, divided by its p99 latency alone.
+The polite client sends 50 questions per second. The attacker has another address and sends costly,
+refused or cheap requests without pauses, from a process of its own. Windows with and without an
+attack alternate. The result of an attack is the p99 latency of the polite client, divided by its
+p99 latency alone.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Iterator
 from multiprocessing import get_context
+from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -23,6 +25,7 @@ from benchmarks.load.windows import Window, at_concurrency, at_rate, joined
 RATE: Final = 50.0
 _BATCH, _SCENE, _TEXT = 2 * 2**20, 256 * 2**10, 64 * 2**10  # sizes of bodies in bytes
 _LIMIT: Final = 5.0
+_GET: Final = b"GET %b HTTP/1.1\r\nHost: %b\r\n\r\n"
 
 
 def main(
@@ -92,6 +95,9 @@ def attacks(labels: list[str]) -> Iterator[tuple[str, bytes]]:
     yield "largest answer", prepared("/relations", largest(labels))
     yield "batch of relations", sent("/missing/batch", filled(related, _BATCH, b'{"scenes":['))
     yield "batch of poses", prepared("/outliers/batch", {"scenes": [{"objects": [bed] * 40}] * 256})
+    yield "refused hosts", _GET % (b"/models", b"evil.example")
+    yield "unknown paths", _GET % (b"/nowhere", b"127.0.0.1")
+    yield "health checks", _GET % (b"/health/ready", b"127.0.0.1")
     yield "candidates", sent("/missing", filled(b'"x y z"', _SCENE // 8, scene % b"candidates"))
 
 
@@ -129,18 +135,22 @@ class attacker:  # noqa: N801 - a context manager
     """An attack until the end of the context, by a process of its own."""
 
     def __init__(self, port: int, request: bytes, connections: int, seconds: float) -> None:
-        arguments = port, [request], connections, seconds, "127.0.0.2"
-        self._process = get_context("spawn").Process(target=_attack, args=arguments)
+        context = get_context("spawn")
+        self._began = context.Event()
+        arguments = self._began, port, [request], connections, seconds, "127.0.0.2"
+        self._process = context.Process(target=_attack, args=arguments)
 
     def __enter__(self) -> None:
         self._process.start()
+        self._began.wait(60)
 
     def __exit__(self, *_: object) -> None:
         self._process.kill()
         self._process.join()
 
 
-def _attack(*arguments: Any) -> None:
+def _attack(began: Event, *arguments: Any) -> None:
+    began.set()
     asyncio.run(at_concurrency(*arguments))
 
 

@@ -4,7 +4,8 @@
     python3 deploy/image.py                      Docker if it runs here, else buildah
     python3 deploy/image.py --engine buildah     needs root, buildah and debootstrap, but no daemon
 
-The script checks the image's size, user and HEALTHCHECK, and that the service writes only to /tmp.
+The script checks the image's size, user, HEALTHCHECK and packages, and that the service writes only
+to /tmp.
 Then it removes its containers and images. Docker enforces a read-only root. Under buildah, the
 script looks for written files, because chroot isolation has a writable root.
 
@@ -50,6 +51,11 @@ QUESTIONS: list[tuple[str, dict[str, Any]]] = [
 # Fails if COPY did not obey .dockerignore. The compilation of kernels writes __pycache__ itself.
 CONTENTS = """test "$(echo *)" = "app compiled model_store models scene_client" &&
     test "$(stat -c %u models)" = 10001 && test -z "$(find app scene_client -name .numba_cache)" """
+
+# Lists the installed packages as a lock file does.
+PACKAGES = """import importlib.metadata as m
+for d in m.distributions(): print(d.metadata["Name"].lower().replace("_", "-"), d.version, sep="==")
+"""
 
 
 class ImageError(Exception):
@@ -161,8 +167,8 @@ class Docker:
         command = ["docker", "run", "--detach", *confined, privileges, publish, self.image]
         self.container = run(*command)
 
-    def execute(self, command: Sequence[str]) -> None:
-        run("docker", "exec", self.container, *command)
+    def execute(self, command: Sequence[str]) -> str:
+        return run("docker", "exec", self.container, *command)
 
     def is_running(self) -> bool:
         return run("docker", "inspect", "-f", "{{.State.Running}}", self.container) == "true"
@@ -270,7 +276,8 @@ class Buildah:
         self.container = run(*self.command("from", self.image))
         self.root = Path(run(*self.command("mount", self.container)))
         self.started = time.time()
-        self.variables = ["--env", "SCENE_HOST=127.0.0.1", "--env", f"SCENE_PORT={port}"]
+        settings = "SCENE_HOST=127.0.0.1", f"SCENE_PORT={port}", f"SCENE_HEALTH_PORT={free_port()}"
+        self.variables = [part for setting in settings for part in ("--env", setting)]
         with self.output.open("w") as log:
             streams = {"stdout": log, "stderr": log, "text": True}
             self.service = subprocess.Popen(self.inside(config["Cmd"]), **streams)
@@ -279,8 +286,8 @@ class Buildah:
         flags = ["--isolation", "chroot", "--network", "host", *self.variables]
         return self.command("run", *flags, self.container, "--", *command)
 
-    def execute(self, command: Sequence[str]) -> None:
-        run(*self.inside(command))
+    def execute(self, command: Sequence[str]) -> str:
+        return run(*self.inside(command))
 
     def is_running(self) -> bool:
         return self.service.poll() is None
@@ -364,6 +371,25 @@ def is_plausible(answers: dict[str, Any]) -> dict[str, bool]:
     }
 
 
+def free_port() -> int:
+    """Return a free port of the loopback address."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def check_packages(listing: str, lock: str) -> None:
+    """Compare the packages of the image with its lock file, of which the bill of materials is made.
+
+    Raises:
+        ImageError: they differ.
+    """
+    locked = {line.split()[0] for line in lock.splitlines() if line[0].isalnum()}
+    if differing := locked ^ set(listing.split()):
+        raise ImageError(f"the image and requirements.lock differ in {sorted(differing)}")
+
+
 def wait_until_healthy(engine: Docker | Buildah, check: list[str]) -> float:
     """Wait until the HEALTHCHECK succeeds, and return the seconds."""
     started = time.monotonic()
@@ -392,12 +418,11 @@ def check(engine: Docker | Buildah) -> None:
     kind, *healthcheck = (config.get("Healthcheck") or {}).get("Test") or ["NONE"]
     if kind != "CMD":
         raise ImageError("the image has no HEALTHCHECK with a list of arguments")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    engine.start(config, port)
+    engine.start(config, port := free_port())
     print(f"healthy after {wait_until_healthy(engine, healthcheck):.1f} s", flush=True)
     engine.execute(["sh", "-c", CONTENTS])
+    lock = (ROOT / "requirements.lock").read_text("utf-8")
+    check_packages(engine.execute(["python", "-c", PACKAGES]), lock)
     answers = {question: ask(port, question, body) for question, body in QUESTIONS}
     if wrong := [name for name, good in is_plausible(answers).items() if not good]:
         raise ImageError("; ".join(f"unexpected /{name}: {answers[name]}"[:2000] for name in wrong))

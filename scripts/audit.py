@@ -1,4 +1,4 @@
-"""Audit the code and its locked packages: known vulnerabilities, risky code, bill of materials.
+"""Audit the code and its locked packages: known vulnerabilities, risky code.
 
 Usage: python scripts/audit.py [--may-be-unreachable]   (or `make audit`)
 
@@ -21,13 +21,12 @@ from enum import Enum
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-# The lock file of torch has no hashes, because its build depends on the machine.
-TORCH = "requirements-torch.lock"
-LOCKS = ("requirements.lock", "requirements-training.lock", "requirements-dev.lock", TORCH)
-# Lock files of the two container images. The images contain no development tools.
-SHIPPED = {"service": ("requirements.lock",), "training": ("requirements-training.lock", TORCH)}
+LOCKS = (
+    *("requirements.lock", "requirements-training.lock", "requirements-dev.lock"),
+    "requirements-torch.lock",
+)
 SOURCES = ("app", "training")
-BILLS = ROOT / "build"
+WORK = ROOT / "build"
 
 # Vulnerability databases that pip-audit can query. The first one that works is used.
 SERVICES = ("pypi", "osv")
@@ -102,7 +101,7 @@ def ask(service: str, *arguments: str) -> tuple[str, str]:
 
 def knows_advisories(service: str) -> Outcome:
     """Return `FOUND` if the vulnerability database reports the vulnerability of `CANARY`."""
-    canary = BILLS / "canary.txt"
+    canary = WORK / "canary.txt"
     canary.write_text(CANARY + "\n", "utf-8")
     outcome = judge(*ask(service, f"--requirement={canary}"), {CANARY.partition("==")[0]})
     if outcome.verdict is Verdict.OK:
@@ -126,7 +125,7 @@ def names(*locks: str) -> set[str]:
 
 def without_hashes(*locks: str) -> Path:
     """Write the packages of several lock files to one file, and return its path."""
-    path = BILLS / "packages.txt"
+    path = WORK / "packages.txt"
     path.write_text("\n".join(pinned(*locks)) + "\n", "utf-8")
     return path
 
@@ -150,24 +149,6 @@ def risky_code() -> Outcome:
     return Outcome(Verdict.OK, (f"no findings in {', '.join(SOURCES)}",))
 
 
-def bills_of_materials() -> Outcome:
-    """Write a CycloneDX bill of materials for each container image, and validate its format."""
-    lines = []
-    for name, locks in SHIPPED.items():
-        bill, packages = BILLS / f"sbom-{name}.cdx.json", str(without_hashes(*locks))
-        done = run(
-            *("cyclonedx_py", "requirements", packages, "--pyproject=pyproject.toml"),
-            *("--output-reproducible", "--validate", f"--output-file={bill}"),
-        )
-        if done.returncode:
-            return Outcome(Verdict.FOUND, (f"{name}: {done.stderr.strip()[-300:]}",))
-        held = {component["name"] for component in json.loads(bill.read_text())["components"]}
-        if missing := sorted(names(*locks) - held):
-            return Outcome(Verdict.FOUND, (f"{name}: missing in the bill: {', '.join(missing)}",))
-        lines.append(f"{bill.name}: {len(held)} packages")
-    return Outcome(Verdict.OK, tuple(lines))
-
-
 def exit_status(verdicts: list[Verdict], *, may_be_unreachable: bool) -> int:
     """Return the exit status of the whole audit, from the results of its parts."""
     if Verdict.FOUND in verdicts:
@@ -183,10 +164,9 @@ def main(arguments: list[str]) -> int:
         help="exit with status 0 if no vulnerability database answers",
     )
     options = parser.parse_args(arguments)
-    BILLS.mkdir(exist_ok=True)
+    WORK.mkdir(exist_ok=True)
     parts = {
         "risky code": risky_code,
-        "bills of materials": bills_of_materials,
         "known vulnerabilities": advisories,
     }
     outcomes = {}

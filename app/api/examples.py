@@ -8,6 +8,7 @@ question in `app.questions` contains the examples of this question.
 from collections.abc import Mapping
 from typing import Any, Final
 
+from app import __version__
 from app.errors import UnknownLabelsError
 from app.questions import QUESTIONS
 from app.questions.question import Example
@@ -153,7 +154,7 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
         "model": _MODEL, "word": "trash can", "class": _BIN, "rule": "alias", "certain": True,
         "suggestions": [],
     },
-    "health_live": {"status": "live", "version": "2.0.0"},
+    "health_live": {"status": "live", "version": __version__},
     "health_ready": {"status": "ready"},
     "show_metrics": (
         "# HELP scene_requests_total Requests answered\n"

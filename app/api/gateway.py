@@ -1,12 +1,15 @@
 """The steps of a request before its route: ASGI middleware with one concern each.
 
 A request passes the steps in the order of this module. `Turn` is the last step before the route.
+Every answer takes a turn, also a refusal of an earlier step and the answer to a health check.
+Otherwise, a client with many of them would take the time of all others.
 """
 
 import hmac
 import logging
 import re
 from asyncio import CancelledError
+from contextlib import suppress
 from dataclasses import dataclass, field
 from time import monotonic, perf_counter
 from typing import Final
@@ -21,7 +24,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from app import errors
 from app.api.problems import answer, from_exception
 from app.questions import QUESTIONS
-from app.serving.admission import SMALL, Admission, Bodies, Ticket
+from app.serving.admission import SMALL, Admission, Bodies, Lane, Ticket
 from app.serving.models import NO_MODELS, Key
 from app.serving.runtime import Runtime
 from app.settings import Settings
@@ -30,7 +33,7 @@ API_KEY: Final = "X-API-Key"
 TIMEOUT_HEADER: Final = "X-Request-Timeout-Ms"
 
 HEALTH: Final = frozenset(("/health/live", "/health/ready"))
-"""Routes of health checks. They accept every Host header and take no turn."""
+"""Routes of health checks. They accept every Host header, and no queue is too full for them."""
 
 # Paths that need no API key. Orchestrators send health checks without credentials. The HTML pages
 # contain no private data. docs/security.md gives the reasons.
@@ -59,10 +62,10 @@ def gateway(app: ASGIApp, settings: Settings, runtime: Runtime) -> ASGIApp:
     """Return the application behind its steps. The last line is the first step of a request."""
     steps: ASGIApp = Turn(app, runtime.admission)
     steps = Size(steps, settings, runtime.bodies)
-    steps = Deadline(steps, app, settings, runtime)
+    steps = Deadline(steps, settings, runtime)
     if settings.api_key is not None:
         steps = KeyCheck(steps, settings.api_key)
-    steps = Failures(steps)
+    steps = Failures(steps, runtime.admission.quick)
     if settings.cors_origins:
         headers = "Authorization", "Content-Type", API_KEY, "X-Request-Id", TIMEOUT_HEADER
         steps = CORSMiddleware(
@@ -73,7 +76,7 @@ def gateway(app: ASGIApp, settings: Settings, runtime: Runtime) -> ASGIApp:
             expose_headers=("Retry-After", "X-Request-Id"),
         )
     if (names := settings.accepted_hosts) is not None:
-        steps = HostCheck(steps, names)
+        steps = HostCheck(steps, names, runtime.admission.quick)
     return Recorded(steps, app, settings, runtime)
 
 
@@ -105,14 +108,16 @@ class Record:
 class Recorded:
     """Complete the headers of each response, and record the request in metrics and access log.
 
-    Later steps find in ``scope["state"]`` the `Record`, the request id, and the path below the root
-    path of the service. The client may choose the request id: 1 to 128 unreserved URI characters or
-    colons. The application ``other`` gets everything but requests, such as the service's start.
+    Later steps find in ``scope["state"]`` the `Record`, the `Ticket`, the request id, and the path
+    below the root path of the service. The client may choose the request id: 1 to 128 unreserved
+    URI characters or colons. The application ``other`` gets everything but requests, such as the
+    service's start.
     """
 
     def __init__(self, app: ASGIApp, other: ASGIApp, settings: Settings, runtime: Runtime) -> None:
         self._app, self._other, self._runtime = app, other, runtime
         self._has_log = settings.access_log
+        self._seconds = settings.request_timeout_ms / 1e3
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
@@ -126,15 +131,20 @@ class Recorded:
             request_id = str(uuid4()).encode()
         upgrades = any(name == b"upgrade" for name, _ in headers)
         record = Record()
+        client = (scope.get("client") or ("",))[0]
+        is_gone = Request(scope, receive).is_disconnected
+        ticket = Ticket(client, monotonic() + self._seconds, is_gone)
         scope.setdefault("state", {}).update(
             request_id=request_id.decode(),
             record=record,
+            ticket=ticket,
             path=scope["path"].removeprefix(scope.get("root_path", "")),
         )
 
         async def send_completed(message: Message) -> None:
             """Send a message to the client. The start of a response gets further headers."""
             if message["type"] == "http.response.start":
+                ticket.leave()
                 record.status = message["status"]
                 completed = [*message.get("headers", ()), *_ALWAYS, (b"x-request-id", request_id)]
                 names = {name for name, _ in completed}
@@ -155,6 +165,9 @@ class Recorded:
             record.outcome = "cancelled"
             raise
         finally:
+            ticket.leave()
+            # The ticket refers to the scope: without this deletion, they form a reference cycle.
+            del scope["state"]["ticket"]
             self._record(scope, record, perf_counter() - began)
 
     def _record(self, scope: Scope, record: Record, seconds: float) -> None:
@@ -189,8 +202,8 @@ class HostCheck:
     machine. That attack needs a name, so every IP address is accepted.
     """
 
-    def __init__(self, app: ASGIApp, names: frozenset[str]) -> None:
-        self._app = app
+    def __init__(self, app: ASGIApp, names: frozenset[str], lane: Lane) -> None:
+        self._app, self._lane = app, lane
         self._names = frozenset(name.encode("ascii") for name in names)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -205,24 +218,35 @@ class HostCheck:
             "The service does not know the name in the Host header. Use its IP address, or list "
             "the name in SCENE_ALLOWED_HOSTS (docs/network.md)."
         )
-        await answer(errors.HostRefusedError(detail), scope, receive, send)
+        await _refuse(errors.HostRefusedError(detail), self._lane, scope, receive, send)
+
+
+async def _refuse(
+    error: errors.ServiceError, lane: Lane, scope: Scope, receive: Receive, send: Send
+) -> None:
+    """Answer with a problem, in a turn of a lane that is never too full, but may end too late."""
+    ticket: Ticket = scope["state"]["ticket"]
+    if not ticket.had_turn:
+        with suppress(errors.DeadlinePassedError):
+            await ticket.enter(lane, 0)
+    await answer(error, scope, receive, send)
 
 
 class Failures:
     """Answer every failure with a problem document."""
 
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
+    def __init__(self, app: ASGIApp, lane: Lane) -> None:
+        self._app, self._lane = app, lane
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request. If its response has begun, raise the error to close the connection."""
         try:
             await self._app(scope, receive, send)
         except Exception as error:  # noqa: BLE001 - _fail() answers and logs every error
-            await _fail(error, scope, receive, send)
+            await _fail(error, self._lane, scope, receive, send)
 
 
-async def _fail(error: Exception, scope: Scope, receive: Receive, send: Send) -> None:
+async def _fail(error: Exception, lane: Lane, scope: Scope, receive: Receive, send: Send) -> None:
     """Answer a failure, or raise it again if a part of the response has been sent already.
 
     A variable of the caller's frame must not refer to the error: that cycle would keep the body.
@@ -232,7 +256,7 @@ async def _fail(error: Exception, scope: Scope, receive: Receive, send: Send) ->
     if record.status:
         record.outcome, record.status = problem.slug, 500
         raise error
-    await answer(problem, scope, receive, send)
+    await _refuse(problem, lane, scope, receive, send)
 
 
 class KeyCheck:
@@ -255,11 +279,10 @@ class KeyCheck:
 
 
 class Deadline:
-    """Give each request a ticket with its deadline, in ``scope["state"]``, except health checks."""
+    """Set the deadline that the client chose. Health checks ignore its header."""
 
-    def __init__(self, app: ASGIApp, health: ASGIApp, settings: Settings, runtime: Runtime) -> None:
-        self._app, self._health, self._runtime = app, health, runtime
-        self._seconds = settings.request_timeout_ms / 1e3
+    def __init__(self, app: ASGIApp, settings: Settings, runtime: Runtime) -> None:
+        self._app, self._runtime = app, runtime
         self._longest = settings.max_request_timeout_ms
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -269,21 +292,14 @@ class Deadline:
             NotReadyError: the service is starting.
             BadRequestError: the time limit in the header of the request is invalid.
         """
-        if scope["state"]["path"] in HEALTH:
-            await self._health(scope, receive, send)
-            return
-        if self._runtime.models is NO_MODELS:
-            raise errors.NotReadyError("The service is starting.")
-        stated = [value for name, value in scope["headers"] if name == b"x-request-timeout-ms"]
-        seconds = self._seconds_of(stated[0]) if stated else self._seconds
-        client = (scope.get("client") or ("",))[0]
-        is_gone = Request(scope, receive).is_disconnected
-        scope["state"]["ticket"] = Ticket(client, monotonic() + seconds, is_gone)
-        try:
-            await self._app(scope, receive, send)
-        finally:
-            # The ticket refers to the scope: without this deletion, they form a reference cycle.
-            del scope["state"]["ticket"]
+        if scope["state"]["path"] not in HEALTH:
+            if self._runtime.models is NO_MODELS:
+                raise errors.NotReadyError("The service is starting.")
+            for name, value in scope["headers"]:
+                if name == b"x-request-timeout-ms":
+                    scope["state"]["ticket"].deadline = monotonic() + self._seconds_of(value)
+                    break
+        await self._app(scope, receive, send)
 
     def _seconds_of(self, value: bytes) -> float:
         if not _TIMEOUT.fullmatch(value) or int(value) > self._longest:
@@ -332,24 +348,7 @@ class Turn:
             QueueFullError: too many requests of the client, or of all clients, are waiting.
             DeadlinePassedError: the deadline passed while the request was waiting.
         """
-        ticket: Ticket = scope["state"]["ticket"]
-
-        async def send_after_turn(message: Message) -> None:
-            ticket.leave()
-            await send(message)
-
-        try:
-            if len(scope["state"]["body"]) > SMALL:
-                await ticket.enter(self._slow, 1)
-            else:
-                try:
-                    await ticket.enter(self._quick, 1)
-                except errors.QueueFullError as error:
-                    # A refusal takes a turn, too. Otherwise refusals of one client would take the
-                    # time of all others.
-                    await ticket.enter(self._quick, 0)
-                    error.detail = "Too many requests of this client are waiting."
-                    raise
-            await self._app(scope, receive, send_after_turn)
-        finally:
-            ticket.leave()
+        state = scope["state"]
+        lane = self._slow if len(state["body"]) > SMALL else self._quick
+        await state["ticket"].enter(lane, 0 if state["path"] in HEALTH else 1)
+        await self._app(scope, receive, send)

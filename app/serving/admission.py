@@ -4,14 +4,14 @@ Requests of different cost wait in different lanes:
 
 | lane | requests | weight of a request | requests at a time |
 |---|---|---|---|
-| quick | all at their start | 1 | 8 |
+| quick | all at their start, and refusals | 1 | 8 |
 | slow | batches, large bodies and scenes, words, documents, files | number of scenes | 2 |
 | draws | `/generate` | number of scenes x sweeps | 1 |
 
 A lane bounds the total weight of its requests. One client holds at most a quarter of a lane, and
 the clients of a lane take turns, so no client can keep others out. Quick requests are computed on
 the event loop, because a change of thread costs as much as most questions. At most 8 start before
-the event loop looks at the network again, so health checks wait a few milliseconds. Scenes of
+the event loop looks at the network again, so new requests wait a few milliseconds. Scenes of
 batches are computed one by one between quick requests, and large scenes and draws in threads of low
 priority. Compiled loops release the interpreter lock, so the event loop can continue.
 
@@ -97,6 +97,7 @@ class Ticket:
     lane: Lane | None = None  # in which the request waits or has its turn
     weight: int = 0
     waited: float = 0.0  # total seconds so far
+    had_turn: bool = False
 
     async def enter(self, lane: Lane, weight: int, line: Hashable = None) -> None:
         """Leave the lane of the request and wait for a turn in another, until the deadline.
@@ -117,6 +118,7 @@ class Ticket:
         self.lane, self.weight = lane, weight
         if lane.free_slots and not lane.queues:
             lane.free_slots -= 1
+            self.had_turn = True
             return
         began, turn = monotonic(), asyncio.get_running_loop().create_future()
         lane.queues.setdefault(self.client if line is None else line, deque()).append(turn)
@@ -135,6 +137,7 @@ class Ticket:
                 raise errors.DeadlinePassedError(detail) from None
             raise
         self.waited += monotonic() - began
+        self.had_turn = True
 
     def leave(self) -> None:
         """End the turn, if the request has one. The next iteration of the event loop frees it."""

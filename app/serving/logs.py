@@ -2,8 +2,14 @@
 
 import json
 import logging
+import os
+import sys
+import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
+from queue import SimpleQueue
+from time import sleep
 from typing import Any, Final, Literal
 
 import orjson
@@ -12,6 +18,15 @@ from app.settings import Settings
 
 _MASK: Final = "**********"
 _PLAIN: Final = logging.Formatter("%(asctime)s %(levelname)-8s %(process)d %(name)s: %(message)s")
+
+MOST_LINES: Final = 10_000
+"""Maximum number of lines that wait for the reader of the log, a few megabytes."""
+
+_TOGETHER: Final = 1000  # lines that are written at once, at most
+# Time in seconds between two writes. Each write stops the event loop for some 50 microseconds.
+_PAUSE: Final = 0.01
+# Time in seconds that the end of the process waits for the reader of the log.
+_PATIENCE: Final = 2.0
 
 # No format shows the thread or the program of a record, and each takes time to find out.
 logging.logThreads = logging.logMultiprocessing = False
@@ -52,6 +67,71 @@ class Masked(logging.Formatter):
         return text
 
 
+class Lines(logging.Handler):
+    """Write lines to standard error on a thread, so that the service never waits for their reader.
+
+    While `MOST_LINES` lines wait, further lines are lost. A later line states their number.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._file = sys.stderr.fileno()
+        self._queue = SimpleQueue[str | threading.Event]()
+        self._lost = self._stated = 0  # lost lines since the start
+        threading.Thread(target=self._write, name="log", daemon=True).start()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Put the line of a record into the queue, or count it as lost."""
+        if self._queue.qsize() >= MOST_LINES:
+            self._lost += 1
+            return
+        try:
+            self._queue.put(self.format(record))
+        except Exception:  # noqa: BLE001 - an invalid record must not end a request
+            self.handleError(record)
+
+    def flush(self) -> None:
+        """Wait until all lines are written, but not long, because their reader may have stopped."""
+        written = threading.Event()
+        self._queue.put(written)
+        written.wait(_PATIENCE)
+
+    def _write(self) -> None:
+        """Write the lines of the queue, for ever."""
+        while True:
+            entries = [self._queue.get()]
+            sleep(_PAUSE)
+            count = min(self._queue.qsize(), _TOGETHER)
+            entries += [self._queue.get() for _ in range(count)]
+            lines = [entry for entry in entries if isinstance(entry, str)]
+            if lost := self._lost - self._stated:
+                self._stated += lost
+                lines.append(self._statement(lost))
+            with suppress(OSError):  # the reader has closed the pipe
+                self._write_whole("".join(f"{line}\n" for line in lines))
+            for entry in entries:
+                if isinstance(entry, threading.Event):
+                    entry.set()
+
+    def _statement(self, lost: int) -> str:
+        message = f"{lost} log lines are lost, because standard error was not read in time"
+        return self.format(
+            logging.LogRecord("app.log", logging.WARNING, "", 0, message, None, None)
+        )
+
+    def _write_whole(self, text: str) -> None:
+        # A file object would block the end of the process, because this thread holds its lock.
+        rest = memoryview(text.encode(errors="backslashreplace"))
+        while rest:
+            rest = rest[os.write(self._file, rest) :]
+
+
+def flush() -> None:
+    """Write the waiting log lines, before a signal ends the process."""
+    for handler in logging.getLogger().handlers:
+        handler.flush()
+
+
 def _is_useful(record: logging.LogRecord) -> bool:
     # uvicorn advises to install a WebSocket library. The service answers upgrades as plain HTTP.
     return not str(record.msg).startswith("No supported WebSocket library")
@@ -77,7 +157,7 @@ def log_config(settings: Settings) -> dict[str, Any]:
         "formatters": {"masked": formatter},
         "handlers": {
             "stderr": {
-                "class": "logging.StreamHandler",
+                "()": Lines,
                 "formatter": "masked",
                 "filters": [_is_useful],
             }

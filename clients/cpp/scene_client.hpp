@@ -1,4 +1,5 @@
-// C++17 client of the scene-reasoning service: one header, based on cpp-httplib and nlohmann/json.
+// C++17 client 2.0.0 of the scene-reasoning service: one header, based on cpp-httplib and
+// nlohmann/json.
 //
 //     scene::Client service({"http://127.0.0.1:8000"});
 //     auto answer = service.missing({{"objects", {"bed", "nightstand"}}, {"top_k", 5}});

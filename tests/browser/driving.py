@@ -113,9 +113,23 @@ class Board:
         return self.page.locator(f"[data-question={question}] article").first
 
     def rows(self, question: str) -> list[str]:
-        """The entries of an answer, each in one line."""
-        texts = self.column(question).locator("ol > li").all_inner_texts()
+        """The entries of an answer, each in one line, also those in folds, which it opens."""
+        answers = self.column(question)
+        answers.locator("ol details").evaluate_all("all => all.forEach((one) => (one.open = true))")
+        texts = answers.locator("ol > li:not(.group, .fold)").all_inner_texts()
         return [plain(text) for text in texts]
+
+    @property
+    def groups(self) -> dict[str, list[str]]:
+        """The headings of the tab "Wrong", and the visible entries below each."""
+        every = self.column("outliers").locator("li.group").all()
+        visible = "li:visible:not(.fold)"
+        return {
+            plain(one.locator("h3").text_content()): [
+                plain(text) for text in one.locator(visible).all_inner_texts()
+            ]
+            for one in every
+        }
 
     def curl(self, question: str) -> str:
         return self.column(question).locator("pre").first.text_content() or ""

@@ -5,9 +5,10 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
+from axe_playwright_python.sync_playwright import Axe  # type: ignore[import-untyped]
 from playwright.sync_api import expect
 
-from tests.browser.driving import Board
+from tests.browser.driving import Board, OpenBoard
 from tests.client.scene_files import EXAMPLES
 
 pytestmark = pytest.mark.system
@@ -83,7 +84,9 @@ def test_scenes_and_class_ids_of_a_file(board: Board) -> None:
     expect(page.locator("#scenes")).to_have_text("of 2: 42")
     board.click("Put on the board")
     assert board.things == ["chair_1", "dining table_1"]
-    expect(page.locator("#note")).to_contain_text("class '12' has no label")
+    notes = page.get_by_role("region", name="Notes of the file")
+    expect(notes).to_contain_text("The file was read with 1 note.")
+    expect(notes).to_contain_text("class '12' has no label")
     assert sent.count("scenes") == 1
     page.get_by_role("button", name="Import, export").click()
     page.get_by_label("Scene, JSON").fill(json.dumps(several))
@@ -94,6 +97,49 @@ def test_scenes_and_class_ids_of_a_file(board: Board) -> None:
     expect(page.locator("#scenes")).to_have_text("of 2: 43")
     board.click("Put on the board")
     assert board.things == ["stool_1"]
+
+
+MANY = [
+    {"scene": 0, "detection": n, "reason": reason, "detail": f"class '{n}' is not read"}
+    for reason, count in (("no-label", 25), ("unread", 2), ("<img src=x>", 1))
+    for n in range(count)
+]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_notes_of_a_file(open_board: OpenBoard, tmp_path: Path, scheme: str) -> None:
+    board = open_board(color_scheme=scheme)
+    page = board.page
+    page.set_viewport_size({"width": 390, "height": 844})
+    board.alter("scenes", lambda found: found | {"notes": MANY})
+    (tmp_path / "labels.txt").write_text("bed\nlamp\n")
+    board.open_file(tmp_path / "labels.txt")
+    page.get_by_role("button", name="Put on the board").click()
+    expect(page.locator("#live")).to_contain_text("The file was read with 28 notes.")
+    board.settle()
+    notes = page.get_by_role("region", name="Notes of the file")
+    kinds = ["Class ids without a label (25)", "Fields that are not read (2)", "<img src=x> (1)"]
+    expect(notes.locator("summary")).to_have_text(kinds)
+    # A fold opens by keyboard, and has a bounded length.
+    notes.locator("summary").first.focus()
+    page.keyboard.press("Enter")
+    texts = notes.locator("details[open] li").all_inner_texts()
+    assert (texts[0], len(texts), texts[-1]) == (
+        "detection 0: class '0' is not read",
+        21,
+        "and 5 more",
+    )
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert Axe().run(page).response["violations"] == []
+    page.get_by_role("button", name="Dismiss the notes").press("Enter")
+    expect(notes).to_be_hidden()
+    expect(page.get_by_role("button", name="Import, export")).to_be_focused()
+    # Another scene has no notes.
+    board.open_file(tmp_path / "labels.txt")
+    board.click("Put on the board")
+    expect(notes).to_be_visible()
+    board.put('["desk"]')
+    expect(notes).to_be_hidden()
 
 
 def test_a_large_file_is_read_without_showing_it(board: Board, tmp_path: Path) -> None:

@@ -368,7 +368,7 @@ def test_additions_are_confirmed(board: Board, recorded: Path, tmp_path: Path) -
     choose(board, recorded, 1)
     board.add("oven")
     board.tab("Wrong")
-    assert any("oven" in row and "does not belong" in row for row in board.rows("outliers"))
+    assert any("oven" in row and "Belongs here" in row for row in board.rows("outliers"))
     board.press("oven", "Delete")
     board.click("This scene is right")
     board.add("oven")
@@ -482,6 +482,7 @@ def test_an_answer_of_another_version_reloads_the_models(board: Board) -> None:
         route.fulfill(response=response, json=found)
 
     board.page.route("**/models", promoted)
-    board.alter("missing", lambda found: found | {"model": found["model"] | {"version": "9.9.9"}})
+    other = {"name": "places-rbm"}
+    board.alter("missing", lambda found: found | {"model": found["model"] | other})
     board.add("cup")
     expect(board.page.locator("#news")).to_contain_text("default is now places-rbm")

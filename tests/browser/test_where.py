@@ -1,6 +1,7 @@
 """The view "Where is it?": rooms of a file or added by hand, places, and places without success."""
 
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -94,8 +95,12 @@ def test_the_rooms_of_a_file(home: Board, api: httpx.Client) -> None:
     assert 5 <= len(shown) <= 10
     for row, place in zip(shown, answer["places"], strict=False):
         assert row.startswith(f"{in_words(place)} {percent(place['probability'])}")
+    on_board = {"bathroom": "bathroom on the board"}
     assert rows(home, "Rooms") == [
-        *(f"{one['room']} {percent(one['probability'])}" for one in answer["rooms"]),
+        *(
+            f"{on_board.get(one['room'], one['room'])} {percent(one['probability'])}"
+            for one in answer["rooms"]
+        ),
         f"not here {percent(answer['not_here'])}",
     ]
     (first, *_) = answer["places"]
@@ -116,23 +121,66 @@ def test_a_place_without_success_loses_probability(home: Board, api: httpx.Clien
     home.settle()
     assert body(home)["searched"] == [{"room": "bathroom", "object": "sink_1"}]
     expect(looked).to_be_focused()
+    expect(home.page.locator("#board .object.searched")).to_have_attribute(
+        "aria-label", re.compile("^sink_1, .*, searched$")
+    )
     expect(article(home)).to_contain_text("Looked at 1 place without finding it.")
     (row,) = [row for row in rows(home, "Places") if "on top of sink_1" in row]
     assert " looked " in row
+    during = shares(api, body(home))
     home.page.get_by_role("button", name="Looked in the room: bathroom: elsewhere").click()
     home.settle()
     assert body(home)["searched"][1:] == [{"room": "bathroom"}]
     after = shares(api, body(home))
     assert after["bathroom"] < before["bathroom"]
+    # The former probabilities stay visible until another question.
+    moved = (percent(each[room]) for room in ("bathroom",) for each in (during, after))
+    assert " → ".join(moved) in next(row for row in rows(home, "Rooms") if "bathroom" in row)
+    chips = article(home).get_by_label("Searched without finding it").locator("li")
+    expect(chips).to_have_text(["bathroom: sink_1✕", "bathroom: the whole room✕"])
+    home.page.get_by_role("button", name="Take back the search: bathroom: sink_1").press("Enter")
+    home.settle()
+    assert body(home)["searched"] == [{"room": "bathroom"}]
     again.click()
     home.settle()
     assert "searched" not in body(home)
+    assert not any("→" in row for row in rows(home, "Rooms"))
     expect(home.page.get_by_role("combobox", name="Thing")).to_be_focused()
     # A new thing begins without searches.
     looked.click()
     home.settle()
     ask(home, "soap")
     assert "searched" not in body(home)
+
+
+def test_the_board_shows_probabilities(home: Board, api: httpx.Client) -> None:
+    ask(home, "toothbrush")
+    answer = api.post("/where", json=body(home)).json()
+    in_room = [place for place in answer["places"] if place["room"] == "bathroom"]
+    for label in ("sink", "bathtub"):
+        of = [one["probability"] for one in in_room if one.get("object") == f"{label}_1"]
+        expect(home.page.locator("#board .names")).to_contain_text(
+            f"{label} {percent(sum(of))}".replace(" %", "\u00a0%")
+        )
+    (rest,) = [one["probability"] for one in in_room if "object" not in one]
+    room = next(one["probability"] for one in answer["rooms"] if one["room"] == "bathroom")
+    here = home.page.locator("#here")
+    assert plain(here.text_content()) == (
+        f"toothbrush in this room: {percent(room)}. At no listed object: {percent(rest)}."
+    )
+    # The menu of an object marks it as searched.
+    home.thing("sink_1").press("Enter")
+    home.page.get_by_role("menuitem", name="Looked here, no toothbrush").press("Enter")
+    home.settle()
+    assert body(home)["searched"] == [{"room": "bathroom", "object": "sink_1"}]
+    expect(home.page.locator("#legend")).to_contain_text("✓ searched")
+    # Another room of the file.
+    home.page.get_by_role("button", name="Show kitchen on the board").press("Enter")
+    home.settle()
+    assert home.things == ["refrigerator_1", "stove_1", "sink_1"]
+    expect(home.page.locator("#board .object.searched")).to_have_count(0)
+    home.tab("Missing")
+    expect(here).to_be_hidden()
 
 
 def test_places_on_the_board_are_highlighted(home: Board) -> None:

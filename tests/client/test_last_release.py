@@ -46,7 +46,8 @@ QUESTIONS: list[tuple[str, Any]] = [
 # change.
 UNREADABLE = [
     ("/generate", {"objects": ["bed"], "seed": 7, "steps": 5}, "`context` of `/generate`"),
-    ("/relations", {"objects": ["bottle", "refrigerator"]}, "the relations `inside` and"),
+    ("/relations", {"objects": ["bed", "nightstand", "lamp"]}, "cannot read `/relations`,"),
+    ("/missing", {"objects": ["refrigerator", "stove"]}, "places inside of a thing"),
 ]
 
 

@@ -27,6 +27,7 @@ def test_the_blocking_client_is_up_to_date():
     ("path", "pattern"),
     [
         ("clients/python/scene_client/__init__.py", r'__version__ = "(.+)"'),
+        ("clients/cpp/scene_client.hpp", r"^// C\+\+17 client (\S+) of "),
         ("clients/ros2/scene_reasoning/package.xml", r"<version>(.+)</version>"),
         ("clients/ros2/scene_reasoning/setup.py", r'version="(.+)"'),
         ("clients/ros2/scene_reasoning_msgs/package.xml", r"<version>(.+)</version>"),

@@ -102,7 +102,7 @@ def test_manifests_fit_the_schemas_of_kubernetes(overlay: Overlay) -> None:
 def test_probes_ask_routes_of_the_service(overlay: Overlay) -> None:
     container = overlay.container
     routes = create_app(Settings(_env_file=None)).openapi()["paths"]
-    (port,) = container["ports"]
+    _, port = container["ports"]
     probes = [container[f"{name}Probe"]["httpGet"] for name in ("startup", "liveness", "readiness")]
     assert all(probe["path"] in routes and probe["port"] == port["name"] for probe in probes)
     assert [probe["path"] for probe in probes[1:]] == ["/health/live", "/health/ready"]
@@ -113,14 +113,17 @@ def test_probes_ask_routes_of_the_service(overlay: Overlay) -> None:
 
 def test_ports_are_those_of_the_image(repository: Path, overlay: Overlay) -> None:
     stage = split_stages((repository / "Dockerfile").read_text("utf-8"))["runtime"]
-    (exposed,) = map(int, re.findall(r"^EXPOSE (\d+)$", stage, re.MULTILINE))
-    assert f"SCENE_PORT={exposed}" in stage
-    assert overlay.config["SCENE_PORT"] == str(exposed)
-    (opened,) = overlay.container["ports"]
-    assert opened["containerPort"] == exposed
+    (exposed,) = re.findall(r"^EXPOSE (\d+) (\d+)$", stage, re.MULTILINE)
+    for name, number in zip(("SCENE_PORT", "SCENE_HEALTH_PORT"), exposed, strict=True):
+        assert f"{name}={number}" in stage
+        assert overlay.config[name] == number
+    opened = overlay.container["ports"]
+    assert [str(port["containerPort"]) for port in opened] == list(exposed)
     for name in ("scene", "scene-replicas"):
         (port,) = overlay.spec("Service", name)["ports"]
-        assert (port["port"], port["targetPort"]) == (exposed, opened["name"])
+        assert (str(port["port"]), port["targetPort"]) == (exposed[0], opened[0]["name"])
+    (rule,) = overlay.spec("NetworkPolicy")["ingress"]
+    assert [str(port["port"]) for port in rule["ports"]] == list(exposed)
 
 
 def test_variables_are_valid_settings(monkeypatch, repository, overlay):
@@ -191,12 +194,22 @@ def test_the_network_policy_opens_the_ports_in_use(overlay: Overlay) -> None:
     policy = overlay.spec("NetworkPolicy")
     assert set(policy["policyTypes"]) == {"Ingress", "Egress"}
     (entry,) = policy["ingress"]
+    peers = {name for peer in entry["from"] for name in peer}
+    assert peers == {"podSelector", "namespaceSelector"}
+    access = {"matchLabels": {"scene-access": "true"}}
+    assert all(selector == access for peer in entry["from"] for selector in peer.values())
     opened = [port["containerPort"] for port in overlay.container["ports"]]
     assert [port["port"] for port in entry["ports"]] == opened
     out = {(port["port"], port["protocol"]) for rule in policy["egress"] for port in rule["ports"]}
     dns = {(53, "UDP"), (53, "TCP")}
     has_bucket = any(one["name"] == "bucket" for one in overlay.pod.get("initContainers", ()))
     assert out == (dns | {(443, "TCP")} if has_bucket else dns)
+
+
+def test_the_base_asks_for_a_proxy_and_names_the_label_of_its_policy(folder: Path) -> None:
+    first, *lines = (folder / "base" / "kustomization.yaml").read_text("utf-8").splitlines()
+    assert "needs a proxy in front" in first
+    assert any(re.search(r"kubectl label namespace .+ scene-access=true$", line) for line in lines)
 
 
 def test_the_sidecar_copies_versions(folder: Path, find_tool: FindTool, tmp_path: Path) -> None:

@@ -59,21 +59,68 @@ def test_workflows_run_every_python_of_the_packages(repository: Path) -> None:
         assert re.fullmatch(r"[\w/-]+@[0-9a-f]{40}", step["uses"]), "actions are pinned by commit"
 
 
+def images(text: str) -> set[str]:
+    """Return the images of a Dockerfile, a compose file or a manifest, without stages of builds."""
+    stages = set(re.findall(r"^FROM .+ AS (\S+)$", text, re.MULTILINE))
+    found = re.findall(r"(?:^FROM|^[ -]+image:(?: &\w+)?) ([^\s*]\S*)", text, re.MULTILINE)
+    return {*found} - stages
+
+
+def test_images_of_others_have_a_digest(repository: Path) -> None:
+    """A tag may name another image tomorrow. Images of this repository are built by its users."""
+    files = [repository / "Dockerfile", repository / "docker-compose.yml"]
+    files += sorted((repository / "deploy").rglob("*.yaml"))
+    found = set().union(*(images(path.read_text("utf-8")) for path in files))
+    others = {name for name in found if "scene-boltzmann" not in name}
+    repositories = {name.partition(":")[0] for name in others}
+    expected = {"python", "haproxy", "prom/prometheus", "grafana/grafana", "rclone/rclone"}
+    assert repositories == expected
+    for name in others:
+        assert re.fullmatch(r"[a-z/]+:[\w.-]+@sha256:[0-9a-f]{64}", name), name
+    pages = [repository / "README.md", *(repository / "docs").rglob("*.md")]
+    for page in pages:
+        for name in re.findall(rf"\b(?:{'|'.join(expected)}):\S+", page.read_text("utf-8")):
+            assert "@sha256:" in name, f"{page.name}: {name}"
+
+
 @pytest.fixture
-def unit(repository: Path, tmp_path: Path) -> Path:
-    """The unit of systemd, with this interpreter in place of the installed one."""
-    text = (repository / "deploy/systemd/scene.service").read_text("utf-8")
-    unit = tmp_path / "scene.service"
-    unit.write_text(text.replace("/opt/scene/.venv/bin/python", sys.executable))
-    return unit
+def units(repository: Path, tmp_path: Path) -> Path:
+    """A folder with the units of systemd, with this interpreter in place of the installed one."""
+    for path in (repository / "deploy/systemd").iterdir():
+        text = path.read_text("utf-8").replace("/opt/scene/.venv/bin/python", sys.executable)
+        (tmp_path / path.name).write_text(text)
+    return tmp_path
 
 
-def test_the_unit_is_valid_and_confined(find_tool: FindTool, unit: Path) -> None:
+@pytest.fixture
+def unit(units: Path) -> Path:
+    return units / "scene.service"
+
+
+@pytest.mark.parametrize("name", ["scene.service", "scene-proxy.service"])
+def test_the_units_are_valid_and_confined(find_tool: FindTool, units: Path, name: str) -> None:
     systemd = find_tool("systemd-analyze")
-    verified = run_program(systemd, "verify", "--man=no", unit)
+    find_tool("haproxy")  # the unit names its path
+    verified = run_program(systemd, "verify", "--man=no", units / name)
     assert verified.stdout + verified.stderr == ""
     # The threshold is in tenths: at most 2.0 of 10.
-    run_program(systemd, "security", "--offline=true", "--threshold=20", "--no-pager", unit)
+    run_program(systemd, "security", "--offline=true", "--threshold=20", "--no-pager", units / name)
+
+
+def test_a_proxy_stands_before_the_unit(repository: Path, find_tool: FindTool, units: Path) -> None:
+    """The unit names its proxy first, and the proxy asks the port of the service."""
+    assert "proxy of scene-proxy.service" in (units / "scene.service").read_text().splitlines()[0]
+    proxy = (units / "scene-proxy.service").read_text().replace("/opt/scene", str(repository))
+    (settings,) = re.findall(r"^Environment=(.+)$", proxy, re.MULTILINE)
+    variables = dict(setting.split("=") for setting in settings.split())
+    page = (repository / "docs/operations.md").read_text("utf-8")
+    host, _, port = variables["PROXY_BACKEND"].partition(":")
+    assert f"SCENE_PORT={port} SCENE_TRUSTED_PROXIES={host} | sudo tee -a /etc/scene/" in page
+    assert host == Settings.model_fields["host"].default
+    check, _ = re.findall(r"^ExecReload=(.+)$", proxy, re.MULTILINE)
+    (start,) = re.findall(r"^ExecStart=(.+)$", proxy, re.MULTILINE)
+    assert start.split()[-1] == check.split()[-1]
+    run_program(find_tool("haproxy"), *check.split()[1:], env=os.environ | variables)
 
 
 def test_the_unit_names_settings_and_commands_that_exist(unit: Path, tmp_path: Path) -> None:

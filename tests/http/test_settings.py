@@ -44,6 +44,7 @@ def test_settings_of_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyP
 INVALID = {
     "host": ["", "http://127.0.0.1", "[::1", "127.0.0.1:8000"],
     "port": [-1, 65536, "tcp://10.0.0.1:80"],
+    "health_port": [0, 65536, 8000],
     "store_poll": [-1, "nan", 3601],
     "store": ["no/such/directory", __file__],
     "api_key": ["too-short", "has spaces in between", "sixteen-chars-é-no"],

@@ -21,7 +21,7 @@ from tests.services import PATIENCE, LiveService, begin, free_port, is_ready, la
 pytestmark = pytest.mark.system
 
 Start = Callable[..., subprocess.Popen[str]]
-IN_USE = "SCENE_PORT: another program uses 127.0.0.1:{}; set SCENE_PORT to a free port\n"
+IN_USE = "SCENE_{0}: another program uses 127.0.0.1:{1}; set SCENE_{0} to a free port\n"
 WAITING = """
 import sys, time
 from pathlib import Path
@@ -73,11 +73,12 @@ def starting(shared_store: Path, log: Path) -> Iterator[Start]:
         process.wait(timeout=PATIENCE)
 
 
-def test_a_used_port_ends_the_start(starting: Start, log: Path) -> None:
+@pytest.mark.parametrize("name", ["PORT", "HEALTH_PORT"])
+def test_a_used_port_ends_the_start(starting: Start, log: Path, name: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        assert starting(PORT=port).wait(timeout=PATIENCE) == 3
-    assert log.read_text() == IN_USE.format(port)
+        assert starting(**{"PORT": 0, name: port}).wait(timeout=PATIENCE) == 3
+    assert log.read_text() == IN_USE.format(name, port)
 
 
 @pytest.mark.parametrize("host", ["203.0.113.1", "no-such-host.invalid"])

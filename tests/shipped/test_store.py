@@ -41,17 +41,41 @@ def test_the_store_states_replaced_models():
     assert shipped.default == STORE.aliases()["default"]
     assert {*shipped.names.values()} <= {*SHIPPED}
     assert not {*shipped.names} & {*SHIPPED}
+    # Without digests, an upgrade leaves the alias `default` at the old model.
+    without = {name for name, replaced in shipped.replaced.items() if not replaced.digests}
+    assert without == {"procthor-triway"}, "in 1.0.0, this was an alias"
     upgrading = (REPOSITORY / "docs" / "upgrading.md").read_text()
     for old, new in shipped.names.items():
         assert re.search(rf"^\|[^|]*`{old}`[^|]*\| `{new}`", upgrading, re.MULTILINE), old
 
 
+TERMS = (STORE.root / "TERMS.md").read_text()
+
+
 def test_the_terms_of_each_model_are_those_of_its_data(artifact):
-    text = (STORE.root / "TERMS.md").read_text()
-    rows = dict(re.findall(r"^\| `([\w-]+)` \| ([^|]+) \|", text, re.MULTILINE))
-    assert sorted(rows) == SHIPPED
-    restricted = any(source.research_only for source in artifact.manifest.data)
-    assert (rows[artifact.manifest.name].strip() == "research only") == restricted
+    rows = re.findall(r"^\| `([\w-]+)` (\S+) \| ([^|]+) \| (.+) \|$", TERMS, re.MULTILINE)
+    assert sorted(name for name, *_ in rows) == SHIPPED
+    manifest = artifact.manifest
+    ((version, use, reason),) = [row[1:] for row in rows if row[0] == manifest.name]
+    assert version == manifest.version
+    restricted = [source.terms for source in manifest.data if source.research_only]
+    assert (use == "research only") == bool(restricted)
+    for terms in restricted:
+        assert terms.split(" (")[0] in reason
+
+
+@pytest.mark.parametrize("artifact", SHIPPED[:3], indirect=True)
+def test_the_terms_list_each_source_with_its_licence(artifact):
+    table = re.findall(r"^\| .+? \| (.+) \| (.+) \| (.+) \|$", TERMS, re.MULTILINE)
+    data = {source.source: source.terms for source in artifact.manifest.data}
+    listed = {name for cell, *_ in table for name in re.findall(r"`(\w+)`", cell)}
+    assert listed == data.keys()
+    for name, terms in data.items():
+        rows = [(licence, credit) for cell, licence, credit in table if f"`{name}`" in cell]
+        assert all(licence in terms for licence, _ in rows), name
+        authors = re.findall(r"(\w+) et al\.|\((\w+), \w+, \w+", terms)
+        for author in filter(None, (word for pair in authors for word in pair)):
+            assert any(author in credit for _, credit in rows), (name, author)
 
 
 def test_an_artifact_is_small(artifact):

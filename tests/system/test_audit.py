@@ -1,4 +1,4 @@
-"""The audit reports databases that give no answer."""
+"""The audit reports databases that give no answer. Bills of materials have every package."""
 
 import json
 from functools import partial
@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from scripts import audit
+from app import __version__
+from scripts import audit, sbom
 from scripts.audit import Outcome, Verdict, judge
 
 pytestmark = pytest.mark.system
@@ -78,6 +79,19 @@ def test_a_database_needs_the_canary(monkeypatch, tmp_path, answers, verdict, lo
         return report(*map(sound, audit.names(*audit.LOCKS))), ""
 
     monkeypatch.setattr(audit, "ask", ask)
-    monkeypatch.setattr(audit, "BILLS", tmp_path)
+    monkeypatch.setattr(audit, "WORK", tmp_path)
     assert audit.advisories().verdict is verdict
     assert services == lock_services
+
+
+@pytest.mark.parametrize("name", ["service", pytest.param("training", marks=pytest.mark.slow)])
+def test_a_bill_has_the_versions_and_hashes_of_the_locks(monkeypatch, tmp_path, name) -> None:
+    monkeypatch.setattr(sbom, "BILLS", tmp_path)
+    bill = json.loads(sbom.bill_of_materials(name).read_text("utf-8"))
+    assert bill["bomFormat"] == "CycloneDX"
+    assert bill["metadata"]["component"]["version"] == __version__
+    components = {f"{one['name']}=={one['version']}": one for one in bill["components"]}
+    assert components.keys() == set(audit.pinned(*sbom.SHIPPED[name]))
+    for pin, component in components.items():
+        references = component.get("externalReferences", [{}])
+        assert any("hashes" in one for one in references) or pin.startswith("torch=="), pin

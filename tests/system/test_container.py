@@ -4,15 +4,17 @@ import os
 import re
 import sys
 from configparser import ConfigParser
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import pytest
+from packaging.specifiers import SpecifierSet
 
 from app.registry import AliasTarget, Store, load_model_set
 from app.registry.references import aliases_to_bytes
 from app.settings import Settings
-from deploy.image import first_base, pip_settings
+from deploy.image import PACKAGES, ImageError, check_packages, first_base, pip_settings
 from tests.conftest import run_program
 
 pytestmark = pytest.mark.system
@@ -40,15 +42,23 @@ def test_stages_have_no_root(stages: dict[str, str], compose: dict[str, Any], na
 def test_the_default_stage_serves(stages: dict[str, str]) -> None:
     assert list(stages)[-1] == "runtime"
     assert '&& exec python -m app"]' in stages["runtime"]
-    assert "/health/ready" in stages["runtime"].split("HEALTHCHECK")[1]
+    check = stages["runtime"].split("HEALTHCHECK")[1]
+    assert "SCENE_HEALTH_PORT" in check
+    assert "/health/ready" in check
     assert "training" not in stages["runtime"]
 
 
 def test_variables_are_settings(stages: dict[str, str], compose: dict[str, Any]) -> None:
     known = {f"SCENE_{field.upper()}" for field in Settings.model_fields}
     in_image = set(re.findall(r"\bSCENE_\w+(?==)", stages["runtime"]))
-    assert {"SCENE_HOST", "SCENE_PORT", "SCENE_STORE"} <= in_image <= known
+    assert {"SCENE_HOST", "SCENE_PORT", "SCENE_HEALTH_PORT", "SCENE_STORE"} <= in_image <= known
     assert compose["services"]["scene"]["environment"].keys() <= known
+
+
+def test_the_proxy_checks_the_health_port(stages, compose, configuration):
+    port = compose["services"]["scene"]["environment"]["SCENE_HEALTH_PORT"]
+    assert f"SCENE_HEALTH_PORT={port} " in stages["runtime"]
+    assert f'check port "${{PROXY_HEALTH_PORT-{port}}}"' in configuration.read_text("utf-8")
 
 
 @pytest.mark.parametrize(
@@ -125,24 +135,46 @@ def pins(repository: Path, lock: str) -> set[str]:
     return {line for line in text.splitlines() if "==" in line and not line.startswith("#")}
 
 
-@pytest.mark.parametrize("lock", ["", "-ray", "-training", "-dev"])
+@pytest.mark.parametrize("lock", ["", "-ray", "-training", "-dev", "-torch-cpu"])
 def test_locks_pin_every_package_by_hash_and_name_no_index(repository: Path, lock: str) -> None:
     """`pip install --require-hashes` refuses a package without a hash."""
     text = (repository / f"requirements{lock}.lock").read_text("utf-8").replace("\\\n", "")
     for line in text.splitlines()[1:]:
         pin = r"[a-z0-9-]+==[0-9][0-9a-z.]*( ; .+?)?"
         assert re.fullmatch(rf"{pin}(\s+--hash=sha256:[0-9a-f]{{64}})+\s*", line), line
-    assert not any(pin.startswith("torch==") for pin in pins(repository, lock))
+    has_torch = any(pin.startswith("torch==") for pin in pins(repository, lock))
+    assert has_torch == (lock == "-torch-cpu")
+
+
+def test_packages_accept_the_first_release_of_each_python() -> None:
+    """Debian 12 has Python 3.11.2, and a package that needs 3.11.5 stops its `make test`."""
+    refused = [
+        f"{package.name} {package.version}: Python {required}"
+        for package in metadata.distributions()
+        if (required := package.metadata["Requires-Python"])
+        and not all(SpecifierSet(required).contains(f"3.{minor}.0") for minor in (11, 12, 13))
+    ]
+    assert not refused
 
 
 def test_only_torch_may_come_from_another_index(repository: Path) -> None:
     assert pins(repository, "-torch") == {"torch==2.13.0"}
+    assert pins(repository, "-torch-cpu") == {"torch==2.13.0 \\"}
     for file in ("Makefile", "Dockerfile"):
         text = (repository / file).read_text("utf-8").replace("\\\n", " ")
         assert "--extra-index-url" not in text
         for line in text.splitlines():
             if "install" in line and "--index-url" in line:
-                assert "--no-deps" in line
+                assert "--no-deps --require-hashes" in line
+
+
+def test_the_image_has_the_packages_of_its_lock_file() -> None:
+    installed = sorted({*run_program(sys.executable, "-c", PACKAGES).stdout.split()})
+    lock = "".join(f"{pin} \\\n    --hash=sha256:00\n" for pin in installed)
+    check_packages("\n".join(installed), lock)
+    for listed in (installed[1:], [*installed, "evil==1.0"]):
+        with pytest.raises(ImageError, match="the image and requirements"):
+            check_packages("\n".join(listed), lock)
 
 
 def test_the_base_image_may_have_a_digest() -> None:

@@ -10,7 +10,7 @@ from app.registry import AliasTarget, Store
 from scene_client import Client
 from tests.chaos.load import REQUESTS, ConstantLoad, Judge
 from tests.http.stores import make_store
-from tests.services import PATIENCE, LiveService, launch, wait_until
+from tests.services import PATIENCE, LiveService, free_port, launch, wait_until
 from tests.system.conftest import Proxy, StartProxy
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
@@ -24,10 +24,12 @@ class Fleet:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.store = Store(make_store(folder / "store"))
+        self.health = [free_port(), free_port()]
         self.replicas = [self.start(number) for number in range(2)]
 
     def start(self, number: int, port: int | None = None, **settings: str) -> LiveService:
         variables = {"SCENE_STORE_POLL": "0.2", "SCENE_DRAIN_SECONDS": "4", **settings}
+        variables["SCENE_HEALTH_PORT"] = str(self.health[number])
         return launch(self.store.root, self.folder / f"log{number}", port=port, **variables)
 
     def promote(self, version: str) -> None:
@@ -45,7 +47,7 @@ class Fleet:
     def configuration(self, shipped: str) -> Path:
         template = next(line for line in shipped.splitlines() if "server-template" in line)
         servers = "".join(
-            f"    server replica{number} 127.0.0.1:{replica.port}\n"
+            f"    server replica{number} 127.0.0.1:{replica.port} port {self.health[number]}\n"
             for number, replica in enumerate(self.replicas)
         )
         path = self.folder / "haproxy.cfg"

@@ -18,6 +18,7 @@ from tests.chaos.wire import LIVE, Wire, exchange, wires
 from tests.services import (
     PATIENCE,
     LiveService,
+    free_port,
     http_server,
     is_ready,
     launch,
@@ -39,8 +40,12 @@ service = live_service(SCENE_CLIENT_TIMEOUT="3")
 @pytest.fixture(scope="module")
 def behind(haproxy: StartProxy, configuration: Path) -> StartProxy:
     def start(service: LiveService, log: Path, **variables: str) -> Any:
-        backend = f"127.0.0.1:{service.port}"
-        return haproxy(configuration, log, PROXY_BACKEND=backend, PROXY_REPLICAS="1", **variables)
+        backend = {
+            "PROXY_BACKEND": f"127.0.0.1:{service.port}",
+            "PROXY_HEALTH_PORT": str(service.port),
+            "PROXY_REPLICAS": "1",
+        }
+        return haproxy(configuration, log, **(backend | variables))
 
     return start
 
@@ -138,8 +143,9 @@ def test_crashes_are_not_repeated(haproxy: StartProxy, configuration: Path, tmp_
             self.close_connection = True
 
     with http_server(Crashing) as url:
-        variables = {"PROXY_BACKEND": url.removeprefix("http://"), "PROXY_REPLICAS": "3"}
-        with haproxy(configuration, tmp_path / "log", **variables) as proxy:
+        address = url.removeprefix("http://")
+        variables = {"PROXY_BACKEND": address, "PROXY_HEALTH_PORT": address.partition(":")[2]}
+        with haproxy(configuration, tmp_path / "log", PROXY_REPLICAS="3", **variables) as proxy:
             answer = httpx.post(f"{proxy.address}/outliers", json=SCENE, timeout=PATIENCE)
     assert answer.status_code == 502
     assert questions == ["/outliers"]
@@ -242,6 +248,53 @@ def test_the_log_has_no_secrets(behind: StartProxy, shared_store: Path, tmp_path
     assert [entry["request_id"] for entry in entries].count("find-me") == 2
 
 
+CHECKED = """
+import sys
+from pathlib import Path
+from app.__main__ import main
+from app.api.health import HealthPort
+from app.questions.missing import MISSING
+
+ask, answer = MISSING.answer, HealthPort._answer
+begun, checks = Path({begun!r}), Path({checks!r})
+
+def busy(model, scene, *args, **parameters):
+    if len(scene.objects) == 5:
+        begun.touch()
+        before = checks.stat().st_size
+        while checks.stat().st_size < before + 4:
+            pass
+    return ask(model, scene, *args, **parameters)
+
+def counted(self, head):
+    with checks.open("ab") as file:
+        file.write(b".")
+    return answer(self, head)
+
+MISSING.answer, HealthPort._answer = busy, counted
+sys.exit(main())
+"""
+"""A program for `launch`: a question about five objects takes until four health checks later."""
+
+
+def test_a_busy_replica_stays_up(behind: StartProxy, shared_store: Path, tmp_path: Path) -> None:
+    program = CHECKED.format(begun=str(tmp_path / "begun"), checks=str(tmp_path / "checks"))
+    health = str(free_port())
+    with (
+        launch(
+            *(shared_store, tmp_path / "service"),
+            program=("-c", program),
+            SCENE_HEALTH_PORT=health,
+        ) as service,
+        behind(service, tmp_path / "log", PROXY_HEALTH_PORT=health) as proxy,
+    ):
+        five = {"objects": ["bed", "lamp", "desk", "chair", "sofa"]}
+        answer = httpx.post(f"{proxy.address}/missing", json=five, timeout=PATIENCE)
+        assert answer.status_code == 200
+        assert (tmp_path / "begun").exists()
+        assert "DOWN" not in proxy.log.read_text()
+
+
 @pytest.mark.slow
 def test_no_service_gives_503(behind: StartProxy, shared_store: Path, tmp_path: Path) -> None:
     with (
@@ -257,7 +310,7 @@ def test_no_service_gives_503(behind: StartProxy, shared_store: Path, tmp_path: 
         assert int(answer.headers["retry-after"]) > 0
 
 
-def test_the_proxy_leaves_room_for_health_checks(configuration: Path) -> None:
+def test_the_proxy_opens_fewer_connections_than_the_service_accepts(configuration: Path) -> None:
     text = configuration.read_text("utf-8")
     (most,) = [int(line.split(" maxconn ")[1].split()[0])
                for line in text.splitlines() if "default-server" in line]  # fmt: skip

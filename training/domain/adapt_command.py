@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import shlex
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
@@ -30,7 +31,7 @@ from training.datasets import AnnotatedScene, DatasetError
 from training.datasets.records import digest_of
 from training.datasets.vocabulary import left_out_line
 from training.domain.adaptation import FEWEST, Adapted, Measured, adapted
-from training.domain.home import JUDGED, Home, confirmed_scene
+from training.domain.home import JUDGED, MAX_ALARMS, MAX_CLASSES, Home, confirmed_scene
 from training.domain.look import of_convention
 from training.domain.material import read_material
 from training.domain.terminal import ROWS, StorePath, console, fail, print_finding, print_lines
@@ -130,8 +131,16 @@ def _next_version(store: Store, name: str) -> str:
 
 
 def _corrected(files: Iterable[Sequence[AnnotatedScene]]) -> list[AnnotatedScene]:
-    """Join the scenes of one home. A later scene replaces an earlier one with its id."""
-    scenes = {scene.scene_id: scene for file in files for scene in file}
+    """Join the scenes of one home. A later scene replaces an earlier one with its id.
+
+    Scenes without a group, the hour of a recording, have their file as group.
+    """
+    scenes = {
+        scene.scene_id: replace(scene, group=f"file {number}") if own_group else scene
+        for number, file in enumerate(files)
+        for scene in file
+        for own_group in (scene.group == scene.scene_id,)
+    }
     homes = sorted({scene.source for scene in scenes.values()})
     if len(homes) > 1:
         raise ConfigError(f"the scenes come from several homes ({', '.join(homes)}): adapt each")
@@ -148,20 +157,36 @@ def _print_home(home: Home, parent: Artifact) -> None:
         lines.append(f"{n} written place{'s' if n > 1 else ''}, each as one confirmed scene")
     if home.new_classes:
         lines.append(
-            f"new classes, judged after {JUDGED} scenes: {', '.join(home.new_classes[:ROWS])}"
+            f"new classes, judged after {JUDGED} scenes: {_listed(home.new_classes, ROWS)}"
         )
     if home.new_rooms:
-        lines.append(f"new room types: {', '.join(home.new_rooms[:ROWS])}")
+        lines.append(f"new room types: {_listed(home.new_rooms, ROWS)}")
+    if home.unlearnt:
+        lines.append(f"beyond the limits of a home: {_listed(home.unlearnt, ROWS)}")
+    if home.too_large:
+        lines.append(
+            f"left out, because a scene is one room with at most {MAX_CLASSES} classes: "
+            f"{_listed(home.too_large, _NAMED)}"
+        )
+    if home.doubted:
+        lines.append(
+            f"taken as unconfirmed, because they have more than {MAX_ALARMS} alarms: "
+            f"{_listed(home.doubted, _NAMED)}"
+        )
     if home.left_out:
         lines.append(
             "left out, because no person has confirmed them. Confirm their scenes on the page if "
             "they belong there:"
         )
         most = sorted(home.left_out.items(), key=lambda entry: -len(entry[1]))[:ROWS]
-        for label, scenes in most:
-            more = ", ..." if len(scenes) > _NAMED else ""
-            lines.append(f"  {label} ({len(scenes)}): {', '.join(scenes[:_NAMED])}{more}")
+        lines += (f"  {label} ({len(ids)}): {_listed(ids, _NAMED)}" for label, ids in most)
     print_lines(*lines)
+
+
+def _listed(words: Sequence[str], most: int) -> str:
+    """Return the first words, and the number of the others."""
+    more = f", and {len(words) - most} more" if len(words) > most else ""
+    return ", ".join(words[:most]) + more
 
 
 def _print_result(result: Adapted) -> None:
@@ -182,10 +207,20 @@ def _print_result(result: Adapted) -> None:
     if result.objections:
         lines.append(f"the weights stay: {'; '.join(result.objections)}")
     if result.exceptions:
-        counts = ", ".join(f"{label} ({n})" for label, n in result.exceptions.most_common(ROWS))
-        lines.append(f"exceptions, never reported from now on: {counts} (confirmed scenes)")
+        counts = [f"{label} ({n})" for label, n in result.exceptions.most_common()]
+        lines.append(
+            f"{len(counts)} exception{'s' if len(counts) > 1 else ''}, never reported from now on: "
+            f"{_listed(counts, ROWS)} "
+            "(confirmed scenes)"
+        )
+    if result.refused:
+        lines.append(f"exceptions are refused: {'; '.join(result.refused)}")
     if result.relations:
-        lines.append(f"usual from now on: {', '.join(result.relations[:ROWS])} (confirmed scenes)")
+        lines.append(f"usual from now on: {_listed(result.relations, ROWS)} (confirmed scenes)")
+    if result.places:
+        lines.append(f"{result.places} relations repeat, and count in the usual places")
+    if result.numbers:
+        lines.append(f"usual numbers of: {_listed(result.numbers, ROWS)}")
     print_lines(*lines)
 
 

@@ -7,7 +7,11 @@
 - With fewer scenes, or if the gate refuses, the weights stay.
 - Classes of confirmed scenes that the model still reports as outliers become exceptions: the new
   version never reports them.
-- Confirmed relations that the model reports as misplaced count as usual ones.
+- A home may become quieter about its habits, and never blind. The gate also refuses weights and
+  exceptions with which the model misses more than a tenth of the true intruders
+  (`training.domain.true_intruders`).
+- Confirmed relations that the model reports as misplaced count as usual ones. Repeated relations
+  and numbers change the statistics (`training.fit.adapt_statistics`).
 """
 
 from __future__ import annotations
@@ -25,8 +29,10 @@ from numpy.typing import NDArray
 from app.inference import Weights
 from app.model import SceneModel
 from app.scene import CANONICAL
-from training.domain.home import Home, alarms_of, with_confirmed, with_exceptions
+from training.domain.home import MAX_EXCEPTIONS, Home, alarms_of, with_exceptions
+from training.domain.true_intruders import LARGEST_LOSS, Case, lost, popularity, true_intruders
 from training.fit.adapt import adapt, part_loss
+from training.fit.adapt_statistics import with_numbers, with_places
 from training.fit.objects import random_parts
 from training.machines import machine_of
 
@@ -75,31 +81,75 @@ class Adapted:
     objections: tuple[str, ...]  # reasons of the gate against new weights
     # Classes that the new model never reports, and in how many confirmed scenes it would.
     exceptions: Counter[str]
+    refused: tuple[str, ...] = ()  # reasons of the gate against exceptions
     relations: tuple[str, ...] = ()  # confirmed relations that the parent reports, in words
+    places: int = 0  # number of repeated relations
+    numbers: tuple[str, ...] = ()  # labels of the classes with numbers of the home
 
 
 def adapted(
     home: Home, *, seed: int = 0, progress: Callable[[str], None] = lambda _: None
 ) -> Adapted:
     """Adapt a model to a home."""
-    measured: Measured | None = None
-    objections: tuple[str, ...] = ()
-    model = home.parent
-    if len(home.measurable) >= FEWEST:
-        measured = measure(home, seed, progress)
-        objections = tuple(measured.objections())
-        if not objections:
-            progress("adapting to all scenes")
-            weights = adapt(model.weights, home.tensors, trained_on=home.trained_on, seed=seed)
-            model = replace(model, weights=weights)
-    exceptions = home.confirmed_alarms(model)
-    news = (exceptions, home.relations, home.new_classes, home.new_rooms)
-    if model is home.parent and not any(news):
-        return Adapted(None, measured, objections, exceptions)
-    model = with_confirmed(with_exceptions(model, exceptions), home.relations)
+    model, measured, objections = _weights(home, seed, progress)
+    progress("asking about true intruders")
+    exceptions, refused = _exceptions(home, model, seed)
+    model, numbers = with_numbers(with_exceptions(model, exceptions), home.numbers)
+    model = with_places(model, home.relations, home.places)
+    is_new = model.weights is not home.parent.weights
+    news = (exceptions, home.relations, home.places, numbers, home.new_classes, home.new_rooms)
     labels = model.vocabulary.labels
     relations = [f"{labels[i]} {CANONICAL[a]} {labels[j]}" for a, i, j in sorted(home.relations)]
-    return Adapted(model, measured, objections, exceptions, tuple(relations))
+    return Adapted(
+        model if is_new or any(news) else None,
+        measured,
+        objections,
+        exceptions,
+        refused,
+        tuple(relations),
+        len(home.places),
+        tuple(numbers),
+    )
+
+
+def _weights(
+    home: Home, seed: int, progress: Callable[[str], None]
+) -> tuple[SceneModel, Measured | None, tuple[str, ...]]:
+    """Return the model with adapted weights, or the parent and the reasons against the weights."""
+    if len(home.measurable) < FEWEST:
+        return home.parent, None, ()
+    measured = measure(home, seed, progress)
+    objections = [*measured.objections()]
+    if objections:
+        return home.parent, measured, tuple(objections)
+    progress("adapting to all scenes")
+    weights = adapt(home.parent.weights, home.tensors, trained_on=home.trained_on, seed=seed)
+    model = replace(home.parent, weights=weights)
+    # Weights can only hide the classes of the recordings.
+    recorded = (home.tensors.v > 0).any(0).numpy()
+    recorded[[*home.habits]] = False
+    objections += _blindness(model, true_intruders(home.parent, recorded.astype(float), seed))
+    return (home.parent if objections else model), measured, tuple(objections)
+
+
+def _exceptions(home: Home, model: SceneModel, seed: int) -> tuple[Counter[str], tuple[str, ...]]:
+    """Return the exceptions of a home, and the reasons against more or against all of them."""
+    found = home.reported(model)
+    exceptions, reasons = Counter(dict(found.most_common(MAX_EXCEPTIONS))), []
+    if more := len(found) - len(exceptions):
+        reasons.append(f"{more} more classes are beyond the {MAX_EXCEPTIONS} of a home")
+    if exceptions:
+        cases = true_intruders(home.parent, popularity(home.parent), seed)
+        if blind := [*_blindness(with_exceptions(model, exceptions), cases)]:
+            return Counter(), (*blind, *reasons)
+    return exceptions, tuple(reasons)
+
+
+def _blindness(model: SceneModel, cases: list[Case]) -> Iterator[str]:
+    """Yield the reason against a model that misses too many true intruders."""
+    missed = lost(model, cases)
+    if missed > LARGEST_LOSS * len(cases):
+        yield f"{missed} of {len(cases)} true intruders would raise no alarm any more"
 
 
 def measure(home: Home, seed: int, progress: Callable[[str], None]) -> Measured:

@@ -2,15 +2,21 @@
 
 Only a person can tell a habit of the home from a fault. So an unconfirmed scene does not teach the
 objects that the model reports as outliers: they are neither present nor absent there. A confirmed
-scene teaches all its objects.
+scene teaches all its objects, and the classes that it confirms in its room type count as confirmed
+in all recorded scenes of this room type.
+
+One broken recording must not make the model blind. A scene with more than `MAX_CLASSES` classes is
+no room, so it teaches nothing. A confirmed scene with more than `MAX_ALARMS` alarms counts as
+unconfirmed. A home has at most `MAX_NEW` new classes, and an hour at most a quarter of the weight
+(`weights_of_hours`).
 
 Each written place (`training.datasets.inventories`) is one confirmed scene. A thing that most such
-places lack teaches nothing there, but the model never reports it.
+places lack teaches nothing there, but the model never reports it. The model is also asked about
+each written thing in typical scenes of its room type, because a row of a table alone is no room.
 
 Confirmed relations that the model reports as misplaced count as usual ones: the new model never
-reports them (`app.model.Misplaced.confirmed`). Such a relation of two classes also counts like
-`_SCENES` training scenes in the places of the model (`app.model.Places`), so the place
-becomes a usual one for missing objects.
+reports them. Relations and numbers of objects that repeat become likelier
+(`training.fit.adapt_statistics`).
 
 A label that the model cannot read becomes a new class. It is judged once `JUDGED` scenes show it.
 """
@@ -18,14 +24,14 @@ A label that the model cannot read becomes a new class. It is judged once `JUDGE
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final
 
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from app.model import SceneModel
@@ -33,17 +39,26 @@ from app.questions.misplaced import THE_FLOOR
 from app.questions.outliers import intruders
 from app.scene import ObjectClass, Scene, Vocabulary, label_key
 from app.scene.spatial_relations import STACKED
+from scene_client.schemas.requests import MAX_LABEL
 from training.datasets import AnnotatedScene, encode
 from training.datasets.cases import Triple, scene_of
-from training.datasets.inventories import SHARE, Place, complete_scene
+from training.datasets.inventories import SHARE, Place, complete_scene, shipped_inventory
 from training.datasets.moved import has_boxes, posed_scene
 from training.datasets.vocabulary import curated_names
 from training.evaluation.asking import canonical_triple, index_of_ids, score_misplaced
 from training.evaluation.parts import of_classes
-from training.fit.adapt import HomeScenes, TrainedOn, extended
-from training.fit.regression import recalibrated
+from training.fit.adapt import HomeScenes, TrainedOn, extended, usual_classes
+from training.fit.adapt_statistics import Numbers
 
-JUDGED = 3  # number of scenes with a new class from which its objects are judged
+JUDGED: Final = 3  # number of scenes with a new class from which its objects are judged
+MAX_CLASSES: Final = 64  # of a recorded scene
+MAX_ALARMS: Final = 12  # of a confirmed scene
+MAX_NEW: Final = 200  # new classes of a home
+MAX_NEW_ROOMS: Final = 32
+MAX_EXCEPTIONS: Final = 64  # classes of a home that the model never reports
+
+_LEAST_OF_HOUR, _SHARE_OF_HOUR = 20.0, 0.25
+_TYPICAL = 4  # written scenes of a room type in which the model is asked about a written thing
 
 
 @dataclass(frozen=True)
@@ -74,7 +89,15 @@ class Home:
     recorded: int  # number of recorded scenes, with the repeated ones
     # Ids of the unconfirmed scenes in which each label is left out.
     left_out: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    # Room type and class of the alarms of the parent in confirmed scenes.
+    confirmed_alarms: frozenset[tuple[int | None, int]] = frozenset()
     relations: frozenset[Triple] = frozenset()  # confirmed, but misplaced for the parent
+    # Other relations, with the number of their recorded scenes; at least `JUDGED`.
+    places: Mapping[Triple, int] = field(default_factory=dict)
+    numbers: tuple[Numbers, ...] = ()  # of instances in the recorded scenes
+    unlearnt: tuple[str, ...] = ()  # labels and room types beyond the limits
+    too_large: tuple[str, ...] = ()  # ids of scenes with more than `MAX_CLASSES` classes
+    doubted: tuple[str, ...] = ()  # ids of confirmed scenes with more than `MAX_ALARMS` alarms
 
     @classmethod
     def of(
@@ -84,27 +107,39 @@ class Home:
 
         Scenes with equal classes and room type count once, because a robot sees a room many times.
         """
-        confirmed = [*recorded, *map(confirmed_scene, places)]
-        parent = _with_new_words(model, confirmed)
-        scenes: dict[tuple[object, ...], tuple[HomeScene, str]] = {}
-        for scene in recorded:
-            read = _read(parent, scene)
-            key = (read.room, read.classes.tobytes())
-            if key not in scenes or read.confirmed:
-                scenes[key] = read, scene.scene_id
-        left_out: dict[str, list[str]] = defaultdict(list)
-        for read, scene_id in scenes.values():
-            for c in read.left_out.tolist():
-                left_out[parent.vocabulary.labels[c]].append(scene_id)
-        distinct = (*(read for read, _ in scenes.values()), *(_written(parent, x) for x in places))
+        written = [*map(confirmed_scene, places)]
+        parent, unlearnt = _with_new_words(model, [*recorded, *written])
+        distinct, too_large = _distinct(parent, recorded)
+        alarms = [alarms_of(parent, read.question) for read, _ in distinct]
+        pairs = [*zip(distinct, alarms, strict=True)]
+        doubted = {
+            x.scene_id for (read, x), about in pairs if read.confirmed and len(about) > MAX_ALARMS
+        }
+        habits = {
+            (read.room, c)
+            for (read, scene), about in pairs
+            if read.confirmed and scene.scene_id not in doubted
+            for c in about.tolist()
+        }
+        read, left_out = _without_doubt(parent, pairs, doubted, habits)
+        trusted = [x for _, x in distinct if x.scene_id not in doubted]
+        reported, repeated = seen_relations(parent, [*trusted, *written])
         return cls(
             parent=parent,
             parent_classes=len(model.vocabulary),
             parent_rooms=model.spec.C,
-            scenes=distinct,
+            scenes=(*read, *(_written(parent, place) for place in places)),
             recorded=len(recorded),
             left_out=left_out,
-            relations=frozenset(reported_relations(parent, confirmed)),
+            confirmed_alarms=frozenset(habits),
+            relations=frozenset(reported),
+            places={triple: n for triple, n in repeated.items() if n >= JUDGED},
+            numbers=tuple(
+                _numbers(parent, x, one) for one, (_, x) in zip(read, distinct, strict=True)
+            ),
+            unlearnt=unlearnt,
+            too_large=too_large,
+            doubted=tuple(sorted(doubted)),
         )
 
     @property
@@ -151,16 +186,48 @@ class Home:
             v[row, scene.left_out] = 0
             observed[row, scene.left_out] = False
         rooms = [-1 if scene.room is None else scene.room for scene in self.scenes]
-        return HomeScenes(v, observed, torch.tensor(rooms))
+        weights = weights_of_hours([None if x.written else x.group for x in self.scenes])
+        return HomeScenes(v, observed, torch.tensor(rooms), torch.from_numpy(weights).float())
 
-    def confirmed_alarms(self, artifact: SceneModel) -> Counter[str]:
+    @property
+    def habits(self) -> frozenset[int]:
+        """Classes with a confirmed alarm that are usual in the recorded scenes of the room type."""
+        usual = usual_classes(self.tensors, max(self.parent.spec.C, 1))
+        return frozenset(c for t, c in self.confirmed_alarms if t is not None and usual[t, c])
+
+    def reported(self, artifact: SceneModel) -> Counter[str]:
         """Return the classes that a model reports, with the number of their confirmed scenes."""
         labels, counts = artifact.vocabulary.labels, Counter[str]()
         for scene in self.scenes:
             if scene.confirmed and len(scene.classes):
-                alarms = alarms_of(artifact, scene.question)
-                counts.update(labels[c] for c in alarms.tolist())
+                alarms = set(alarms_of(artifact, scene.question).tolist())
+                if scene.written:
+                    alarms |= self._typical_alarms(artifact, scene)
+                counts.update(labels[c] for c in sorted(alarms))
         return counts
+
+    def _typical_alarms(self, artifact: SceneModel, scene: HomeScene) -> set[int]:
+        """Return the classes of a written place that a model reports in typical scenes."""
+        hosts = self._typical.get(-1 if scene.room is None else scene.room, ())
+        alarms = set[int]()
+        for c in scene.classes.tolist():
+            for host in hosts:
+                asked = replace(of_classes(sorted({*host, c})), room_type=scene.room)
+                if c in alarms_of(artifact, asked):
+                    alarms.add(c)
+                    break
+        return alarms
+
+    @cached_property
+    def _typical(self) -> Mapping[int, Sequence[tuple[int, ...]]]:
+        """Classes of some scenes of each room type with written places, by its index."""
+        found: dict[int, list[tuple[int, ...]]] = defaultdict(list)
+        wanted = {scene.room for scene in self.scenes if scene.written}
+        for scene in shipped_inventory().scenes(1, seed=0) if wanted else ():
+            read = _read(self.parent, scene)
+            if read.room in wanted and read.room is not None and len(found[read.room]) < _TYPICAL:
+                found[read.room].append(tuple(read.classes.tolist()))
+        return found
 
 
 def with_exceptions(artifact: SceneModel, labels: Iterable[str]) -> SceneModel:
@@ -173,24 +240,84 @@ def with_exceptions(artifact: SceneModel, labels: Iterable[str]) -> SceneModel:
     return replace(artifact, vocabulary=replace(vocabulary, objects=objects))
 
 
-def _with_new_words(model: SceneModel, recorded: Sequence[AnnotatedScene]) -> SceneModel:
-    """Return the model with the labels and room types that it cannot read."""
+def weights_of_hours(groups: Sequence[str | None]) -> Float[NDArray[np.float64], "N"]:
+    """Return the weight of each scene: an hour has at most a quarter of the sum, or 20 scenes.
+
+    A group is an hour of the recording, or a file without hours; None is a group of its own.
+    """
+    named = [f"own {k}" if group is None else f"hour {group}" for k, group in enumerate(groups)]
+    _, index, size = np.unique(named, return_inverse=True, return_counts=True)
+    most = float(size.max(initial=0))
+    for _ in range(64):  # the largest solution of most = a quarter of the sum
+        most = max(_LEAST_OF_HOUR, _SHARE_OF_HOUR * float(np.minimum(size, most).sum()))
+    weights: Float[NDArray[np.float64], "N"] = (np.minimum(size, most) / size)[index]
+    return weights
+
+
+def _with_new_words(
+    model: SceneModel, recorded: Sequence[AnnotatedScene]
+) -> tuple[SceneModel, tuple[str, ...]]:
+    """Return the model with the words that it cannot read, and the words beyond the limits."""
     names, vocabulary = curated_names(), model.vocabulary
     scenes_of: Counter[str] = Counter()
-    rooms: dict[str, str] = {}
+    rooms_of: Counter[str] = Counter()
     for scene in recorded:
         labels = {label_key(thing.label): thing.label for thing in scene.objects}.values()
         scenes_of.update({names.canonical(x) for x in labels if vocabulary.look_up(x) is None})
         room = names.canonical_room(scene.room_type)
         if room is not None and names.room_index(scene.room_type, vocabulary) is None:
-            rooms.setdefault(label_key(room), room)
+            rooms_of[room] += 1
     excluded = set(map(label_key, (*names.not_objects, *names.structure)))
-    classes = [
-        ObjectClass(label, anywhere=count < JUDGED)
-        for label, count in sorted(scenes_of.items())
-        if label_key(label) and label_key(label) not in excluded
-    ]
-    return extended(model, classes, sorted(rooms.values()) if model.spec.C else ())
+    words = [x for x in _commonest(scenes_of) if label_key(x) and label_key(x) not in excluded]
+    rooms = _commonest(rooms_of)
+    classes = [ObjectClass(x, anywhere=scenes_of[x] < JUDGED) for x in sorted(words[:MAX_NEW])]
+    new_rooms = sorted(rooms[:MAX_NEW_ROOMS]) if model.spec.C else ()
+    return extended(model, classes, new_rooms), (*words[MAX_NEW:], *rooms[MAX_NEW_ROOMS:])
+
+
+def _commonest(counts: Counter[str]) -> list[str]:
+    """Return the words without those that are too long, the commonest first, one for each key."""
+    ordered = sorted(counts, key=lambda word: (-counts[word], word))
+    by_key = {label_key(word): word for word in reversed(ordered)}
+    return [word for word in ordered if by_key[label_key(word)] == word and len(word) <= MAX_LABEL]
+
+
+_Distinct = list[tuple["HomeScene", AnnotatedScene]]
+
+
+def _distinct(
+    parent: SceneModel, recorded: Sequence[AnnotatedScene]
+) -> tuple[_Distinct, tuple[str, ...]]:
+    """Return one scene for equal classes and room types, and the ids of too large scenes."""
+    scenes: dict[tuple[object, ...], tuple[HomeScene, AnnotatedScene]] = {}
+    too_large = []
+    for scene in recorded:
+        read = _read(parent, scene)
+        if len(read.classes) > MAX_CLASSES:
+            too_large.append(scene.scene_id)
+            continue
+        key = (read.room, read.classes.tobytes())
+        if key not in scenes or read.confirmed:
+            scenes[key] = read, scene
+    return [*scenes.values()], tuple(too_large)
+
+
+def _without_doubt(
+    parent: SceneModel,
+    pairs: Iterable[tuple[tuple[HomeScene, AnnotatedScene], Int[NDArray, "n"]]],
+    doubted: Collection[str],
+    habits: Collection[tuple[int | None, int]],
+) -> tuple[list[HomeScene], dict[str, list[str]]]:
+    """Return the scenes without unconfirmed alarms, and the ids of the scenes with each of them."""
+    scenes, left_out = [], defaultdict[str, list[str]](list)
+    for (read, scene), alarms in pairs:
+        open_ones = [c for c in alarms.tolist() if (read.room, c) not in habits]
+        confirmed = read.confirmed and scene.scene_id not in doubted
+        rows = np.array([] if confirmed else open_ones, dtype=np.int64)
+        scenes.append(replace(read, left_out=rows, confirmed=confirmed))
+        for c in rows.tolist():
+            left_out[parent.vocabulary.labels[c]].append(scene.scene_id)
+    return scenes, dict(left_out)
 
 
 def _read(parent: SceneModel, scene: AnnotatedScene) -> HomeScene:
@@ -200,10 +327,17 @@ def _read(parent: SceneModel, scene: AnnotatedScene) -> HomeScene:
     classes = np.unique([match.entry for match in matches if match is not None]).astype(np.int64)
     classes = classes[~vocabulary.structure[classes]]
     room = names.room_index(scene.room_type, vocabulary) if parent.spec.C else None
-    read = HomeScene(classes, classes[:0], room, scene.group, scene.confirmed)
-    if scene.confirmed or not len(classes):
-        return read
-    return replace(read, left_out=alarms_of(parent, read.question))
+    return HomeScene(classes, classes[:0], room, scene.group, scene.confirmed)
+
+
+def _numbers(parent: SceneModel, scene: AnnotatedScene, read: HomeScene) -> Numbers:
+    """Return the numbers of instances of the taught classes of a recorded scene."""
+    total = Counter[int]()
+    for thing in scene.objects:
+        if (match := parent.vocabulary.look_up(thing.label)) is not None:
+            total[match.entry] += thing.count
+    taught = np.setdiff1d(read.classes, read.left_out)
+    return Numbers(taught, np.array([total[c] for c in taught.tolist()], np.int64), read.room)
 
 
 def confirmed_scene(place: Place) -> AnnotatedScene:
@@ -228,33 +362,42 @@ def alarms_of(artifact: SceneModel, scene: Scene) -> Int[NDArray, "n"]:
     return classes[~artifact.rarely_shown[classes]]
 
 
-_SCENES: Final = 20.0
-
-
-def reported_relations(model: SceneModel, recorded: Sequence[AnnotatedScene]) -> set[Triple]:
-    """Return the stacked relations (a, i, j) of classes that the model reports in confirmed scenes.
+def seen_relations(
+    model: SceneModel, scenes: Sequence[AnnotatedScene]
+) -> tuple[set[Triple], Counter[Triple]]:
+    """Return stacked relations (a, i, j) of classes: reported in confirmed scenes, and repeated.
 
     The model judges each scene as stated and with its boxes, which also show where objects stand.
+    The second result counts the scenes of each relation that the model reports in no scene.
     """
+    reported, confirmed, seen = set[Triple](), set[Triple](), Counter[Triple]()
     if model.places is None:
-        return set()
-    reported: set[Triple] = set()
-    confirmed = [scene for scene in recorded if scene.confirmed]
-    words = [_canonical(scene, model.vocabulary) for scene in confirmed]
-    for encoded in encode(words, model.vocabulary, model.places.roles):
-        holds = encoded.instance_holds
+        return confirmed, seen
+    words = [_canonical(scene, model.vocabulary) for scene in scenes]
+    pairs = zip(scenes, encode(words, model.vocabulary, model.places.roles), strict=True)
+    for scene, encoded in pairs:
+        holds, classes = encoded.instance_holds, encoded.instance_classes.tolist()
         triples = [(a, i, j) for a in STACKED for i, j in np.argwhere(holds[a]).tolist()]
-        scenes = [scene_of(encoded, range(len(encoded.instance_classes)), triples)]
+        seen.update({(a, classes[i], classes[j]) for a, i, j in triples})
+        asked = [scene_of(encoded, range(len(classes)), triples)]
         if has_boxes(encoded):
-            scenes.append(posed_scene(encoded))
-        for scene in scenes if triples else ():
-            index = index_of_ids(scene)
-            for entry in score_misplaced(model, scene):
-                if entry["is_misplaced"] and entry["object"] != THE_FLOOR:
-                    a, i, j = canonical_triple(index, entry)
-                    subject, other = encoded.instance_classes[[i, j]].tolist()
-                    reported |= {(a, subject, other)} if a in STACKED else set()
-    return reported
+            asked.append(posed_scene(encoded))
+        alarms = {x for one in asked if triples for x in _misplaced(model, one, classes)}
+        reported |= alarms
+        confirmed |= alarms if scene.confirmed else set()
+    structure = model.vocabulary.structure
+    kept = {x: n for x, n in seen.items() if not (x in reported or structure[[x[1], x[2]]].any())}
+    return confirmed, Counter(kept)
+
+
+def _misplaced(model: SceneModel, scene: Scene, classes: Sequence[int]) -> Iterator[Triple]:
+    """Yield the stacked relations of classes that the model reports in a scene."""
+    index = index_of_ids(scene)
+    for entry in score_misplaced(model, scene):
+        if entry["is_misplaced"] and entry["object"] != THE_FLOOR:
+            a, i, j = canonical_triple(index, entry)
+            if a in STACKED:
+                yield a, classes[i], classes[j]
 
 
 def _canonical(scene: AnnotatedScene, vocabulary: Vocabulary) -> AnnotatedScene:
@@ -265,17 +408,3 @@ def _canonical(scene: AnnotatedScene, vocabulary: Vocabulary) -> AnnotatedScene:
         for thing, match in zip(scene.objects, matches, strict=True)
     )
     return replace(scene, objects=objects)
-
-
-def with_confirmed(artifact: SceneModel, triples: Iterable[Triple]) -> SceneModel:
-    """Return the model, which never reports these relations of classes."""
-    places, V, triples = artifact.places, len(artifact.vocabulary), sorted(triples)
-    if places is None:
-        return artifact
-    misplaced = artifact.calibration.misplaced.model_copy(update={"confirmed": tuple(triples)})
-    # The keys of relation a between classes i and j; scene counts of equal keys are added.
-    new = np.array([(a * V + i) * V + j for a, i, j in triples], places.triple.dtype)
-    keys, index = np.unique(np.concatenate([places.triple, new]), return_inverse=True)
-    scenes = np.bincount(index, np.concatenate([places.triple_scenes, np.full(len(new), _SCENES)]))
-    places = replace(places, triple=keys, triple_scenes=scenes.astype(places.triple_scenes.dtype))
-    return recalibrated(replace(artifact, places=places), misplaced=misplaced)

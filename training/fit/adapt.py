@@ -1,18 +1,24 @@
 """Adapt the object weights of a trained machine to the scenes of one home.
 
-δ is the change of the bias of each class, and Δ that of the rows of W of the recorded classes. The
-fit minimises
+δ is the change of the bias of each class, and Δ that of the other weights of the recorded classes:
+their rows of W and columns of Y. The fit minimises
 
     n · [mean over parts of recorded scenes of (BCE(hidden classes | listed) - log p(t | listed))
          + 2 · mean over parts of stored samples of the cross-entropy of the parent and the home]
     + ρ_δ |δ|² + ρ_Δ |Δ|²
 
-- Random parts of the n recorded scenes predict the rest, as in training (`training.fit.objects`).
+- Random parts of the recorded scenes predict the rest, as in training (`training.fit.objects`). The
+  fit draws scenes in proportion to their weights, and n is the sum of the weights.
 - The second line is distillation: both machines predict unlisted classes and room types of the
-  stored samples. Without it, the machine forgets other rooms.
+  stored samples. Without it, the machine forgets other rooms. The usual classes of a recorded room
+  type (`usual_classes`) have no part in the samples of that type, because the home knows better.
 - Few scenes without a class k do not prove that the home lacks it. Let the parent expect the class
   in E_k of the n scenes. If no scene shows it, its target is the answer of the parent, divided by
-  1 + E_k: the posterior mean of a rate with the prior exp(-rate), given no event.
+  1 + E_k: the posterior mean of a rate with the prior exp(-rate), given no event. Only δ_k follows
+  this target. W keeps the parent's answer, because weights that lower a class which the home lacks
+  would also raise alarms about it.
+- Usual classes that the parent hardly expects (`_UNEXPECTED`) are habits. The prior of their Δ is
+  weak.
 - New classes (`extended`) and rare ones of the parent have no part in the distillation
   if they are recorded. The prior of their biases is weak, and their biases start at least at the
   log-odds of the share of scenes that show the class.
@@ -53,9 +59,12 @@ _BATCH, _DISTILLED = 96, 48  # parts in a step: of recorded scenes, and of store
 _LEAVE_ONE_OUT = 0.3
 _DISTILLATION = 2.0  # weight of a part of a stored sample, in parts of recorded scenes
 _ROOM_SHARE = 0.5  # share of the parts that list their room type
+_USUAL_SCENES, _USUAL_SHARE = 3, 0.5  # of a class, in the recorded scenes of a room type
 _REPEATS = 4  # random parts of each recorded scene that give E_k
-# Precisions of the normal priors: of biases, of biases of new classes, and of other weights.
-_BIAS, _NEW_BIAS, _WEIGHT = 3.0, 0.03, 0.3
+_UNEXPECTED = 3  # a usual class of a room is a habit if so many times E_k of the scenes show it
+# Precisions of the normal priors: of biases, of biases of new classes, of other weights, and of
+# other weights of habits.
+_BIAS, _NEW_BIAS, _WEIGHT, _HABIT = 3.0, 0.03, 0.3, 0.03
 
 
 @dataclass(frozen=True)
@@ -73,6 +82,7 @@ class HomeScenes(Table):
     v: Float[Tensor, "N V"]  # presence of the classes, without structure
     observed: Bool[Tensor, "N V"]  # classes whose presence or absence the scene shows
     room: Int[Tensor, "N"]  # room type; -1 where unknown
+    weight: Float[Tensor, "N"]  # in scenes
 
 
 def adapt(
@@ -114,13 +124,17 @@ class _Fit:
         # The stored samples do not show new classes, so these are unobserved there.
         samples = torch.from_numpy(parent.chain_samples)
         rooms = torch.from_numpy(parent["fantasy_rooms"]).long()
-        self._samples = HomeScenes(samples, (~new).expand_as(samples), rooms)
+        usual = usual_classes(scenes, max(parent.spec.C, 1))
+        hides = new | (usual[rooms] & (rooms >= 0).unsqueeze(1))
+        self._samples = HomeScenes(samples, ~hides, rooms, torch.ones(len(samples)))
         self._samples = self._samples.rows(samples.sum(1) >= 2)
-        self._unseen_factor = 1 / (1 + self._expected())
+        expected = self._expected()
+        self._unseen_factor = 1 / (1 + expected)
+        self._habits = usual.any(0) & (scenes.weight @ scenes.v > _UNEXPECTED * expected)
         self._precisions = self._changing(new, trained_on.rooms)
         self._start = {weight: weight.clone() for weight in self._precisions}
         # One added scene without the class keeps the share, and so the bias, finite.
-        share = scenes.v.sum(0) / (scenes.observed.sum(0) + 1)
+        share = scenes.weight @ scenes.v / (scenes.weight @ scenes.observed.float() + 1)
         self.machine.b[new] = self.machine.b.maximum(share.logit())[new]
         for weight in self._precisions:
             weight.requires_grad_(True)
@@ -131,27 +145,29 @@ class _Fit:
         repeated = self.scenes.rows(torch.arange(len(self.scenes)).repeat(_REPEATS))
         parts = random_parts(repeated.v, _LEAVE_ONE_OUT, self._generator)
         log_odds = self.parent.object_log_odds(parts.listed, room=repeated.room, share=parts.share)
-        return (repeated.observed * log_odds.sigmoid()).sum(0) / _REPEATS
+        return repeated.weight @ (repeated.observed * log_odds.sigmoid()) / _REPEATS
 
     def _changing(self, new: Bool[Tensor, "V"], old_rooms: int) -> dict[Tensor, Tensor]:
         """Return the weights that change, with the prior precision of each entry; 0 is constant."""
-        # Constant are the rows of unrecorded classes and of the first `old_rooms` room types.
+        # Constant are the entries of unrecorded classes, except in Y for the room types from
+        # `old_rooms` on, and e and Q of the earlier room types.
         machine = self.machine
         bias = torch.where(new, _NEW_BIAS, _BIAS)
-        rows = torch.where(self._recorded, _WEIGHT, 0.0).unsqueeze(1).expand_as(machine.W)
+        of_class = torch.where(self._habits, _HABIT, _WEIGHT) * self._recorded
+        rows = of_class.unsqueeze(1).expand_as(machine.W)
         precisions: dict[Tensor, Tensor] = {machine.b: bias, machine.W: rows}
+        if machine.spec.coupled:
+            precisions[machine.Y] = of_class.repeat(machine.spec.C, 1)
+            precisions[machine.Y][old_rooms:] = _WEIGHT
         if old_rooms < machine.spec.C:
-            of_new_rooms = {"e": _NEW_BIAS, "Q": _WEIGHT, "Y": _WEIGHT}
-            for name in ("e", "Q", "Y") if machine.spec.coupled else ("e", "Q"):
-                weight = machine.get_parameter(name)
-                precision = torch.zeros_like(weight)
-                precision[old_rooms:] = of_new_rooms[name]
-                precisions[weight] = precision
+            for weight, value in ((machine.e, _NEW_BIAS), (machine.Q, _WEIGHT)):
+                precisions[weight] = torch.zeros_like(weight)
+                precisions[weight][old_rooms:] = value
         return precisions
 
     def step(self) -> None:
         """Update the weights by one step of Adam. Constant entries have no gradient."""
-        loss = len(self.scenes) * self._batch_loss() + self._prior()
+        loss = self.scenes.weight.sum() * self._batch_loss() + self._prior()
         self._optimiser.zero_grad()
         loss.backward()
         for weight, precision in self._precisions.items():
@@ -173,10 +189,7 @@ class _Fit:
             machine.object_log_odds(parts.listed, room=room, share=parts.share)
             for machine in (self.parent, self.machine)
         )
-        parent_p, hidden = of_parent.sigmoid(), scenes.v - parts.listed
-        home_target = torch.where(self._recorded, hidden, self._unseen_factor * parent_p)
-        target = torch.where(of_home, home_target, parent_p)
-        loss = (scale * part_loss(log_odds, target, scenes, parts)).sum()
+        loss = (scale * self._object_loss(of_parent, log_odds, scenes, parts, of_home)).sum()
         is_hidden = (room < 0) & (scenes.room >= 0)
         if bool(is_hidden.any()):
             parent_log_p, log_p = (
@@ -188,14 +201,43 @@ class _Fit:
             loss = loss - (scale[is_hidden].unsqueeze(1) * target * log_p).sum()
         return loss
 
+    def _object_loss(
+        self,
+        of_parent: Float[Tensor, "N V"],  # log-odds of the parent
+        log_odds: Float[Tensor, "N V"],
+        scenes: HomeScenes,
+        parts: Parts,
+        of_home: Bool[Tensor, "N 1"],  # False for stored samples
+    ) -> Float[Tensor, "N"]:
+        """Return the loss of the unlisted classes of parts.
+
+        The changed biases of unrecorded classes have a loss of their own, beside the parent's
+        weights. The other loss is without these changes.
+        """
+        parent_p, hidden = of_parent.sigmoid(), scenes.v - parts.listed
+        change = torch.where(self._recorded, 0.0, self.machine.b - self._start[self.machine.b])
+        target = torch.where(of_home & self._recorded, hidden, parent_p)
+        loss = part_loss(log_odds - change, target, scenes, parts)
+        unrecorded = replace(scenes, observed=scenes.observed & ~self._recorded)
+        target = torch.where(of_home, self._unseen_factor, 1.0) * parent_p
+        return loss + part_loss(of_parent + change, target, unrecorded, parts)
+
     def _draw(self, scenes: HomeScenes, size: int) -> HomeScenes:
-        return scenes.rows(torch.randint(len(scenes), (size,), generator=self._generator))
+        drawn = scenes.weight.multinomial(size, replacement=True, generator=self._generator)
+        return scenes.rows(drawn)
 
     def _prior(self) -> Tensor:
         total = torch.zeros(())
         for weight, precision in self._precisions.items():
             total = total + (precision * (weight - self._start[weight]) ** 2).sum()
         return total
+
+
+def usual_classes(scenes: HomeScenes, C: int) -> Bool[Tensor, "C V"]:
+    """Return the classes that most recorded scenes of each room type show, and at least three."""
+    of_room = one_hot(scenes.room[scenes.room >= 0], C).float().T
+    shown, total = of_room @ scenes.v[scenes.room >= 0], of_room.sum(1, keepdim=True)
+    return (shown >= _USUAL_SCENES) & (shown > _USUAL_SHARE * total)
 
 
 _RARE: Final = 0.1  # quantile of the old biases that a new class or room type gets

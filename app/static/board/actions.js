@@ -19,7 +19,8 @@ export function whereabouts(x, y, viewer = { x: 0, y: 0, yaw: 0 }) {
   return Math.abs(left) < 0.05 ? far : `${far}, ${Math.abs(left).toFixed(1)} m ${left > 0 ? 'left' : 'right'}`;
 }
 
-export function createActions(store, say, menu) {
+/** @param {(id: string) => [string, () => void][]} more further entries of the menu of an object */
+export function createActions(store, say, menu, more) {
   const sized = () => sizer(sizesOf(store.get(), store.get().models[0]));
   const find = (id) => store.get().things.find((thing) => thing.id === id);
   const named = (id) => nameOf(find(id) ?? { id, label: id });
@@ -162,6 +163,7 @@ export function createActions(store, say, menu) {
     const asks = ['on-top', 'inside', 'under', 'left', 'right', 'front', 'behind'];
     select(id);
     openMenu(menu, opener, at, [
+      ...more(id),
       ...asks.map((relation) => [`What is missing ${SPOKEN[relation]} it?`, () => ask(relation, id)]),
       ['Rotate by 90°', () => turn(id, 90)],
       ['Add another object of this class', () => add(find(id).label)],

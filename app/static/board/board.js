@@ -6,16 +6,17 @@ import { edgesOf, isDoubtful, judgedBy } from './edges.js';
 import { drawGhosts } from './ghost_drawing.js';
 import { UNKNOWN_SIZE } from './geometry.js';
 import { ghostsOf, ROBOT_SIDE } from './ghosts.js';
-import { labelPlaces, LINE, Places, widthOf } from './labels.js';
+import { createLabels } from './label_drawing.js';
+import { Places } from './labels.js';
 import { inWords, leftOut, reading, sizesOf } from './questions.js';
 import { sizer } from './scene.js';
 import { changed } from './store.js';
 import { fit, gridStep, onScreen, ROUND } from './view.js';
-import { spotsOf } from './spots.js';
-import { nameOf } from './words.js';
+import { searchedOf, spotsOf } from './spots.js';
+import { nameOf, percent, shown } from './words.js';
 
-const MARK = 9; // radius of the mark of an outlier, in pixels
-const FONT = '500 13px system-ui, sans-serif';
+const MOST_LETTERS = 28; // of a name on the board; lists show more
+const [PALE, DEEP] = [12, 70]; // percent of colour in a place of the thing, by its probability
 const SEEN = [
   'things', 'viewer', 'answers', 'shown', 'tab', 'selected', 'draft', 'words', 'at', 'models', 'posed',
   'right', 'line', 'covered', 'room', 'where',
@@ -30,9 +31,9 @@ export function outliersOf(state) {
 export function createBoard(node, store, actions, takeGhost) {
   const svg = d3.select(node);
   const layer = (name) => svg.append('g').attr('class', name);
-  const [grid, robot, objects, edges, ghosts, labels] = ['grid', 'robot', 'objects', 'edges', 'ghosts', 'labels'].map(layer);
+  const [grid, robot, objects, edges, ghosts] = ['grid', 'robot', 'objects', 'edges', 'ghosts'].map(layer);
+  const labels = createLabels(svg, document.getElementById('unnamed'));
   edges.attr('aria-hidden', 'true');
-  labels.attr('aria-hidden', 'true');
   grid.attr('aria-hidden', 'true');
   let view = null;
   let dragging = false;
@@ -90,6 +91,7 @@ export function createBoard(node, store, actions, takeGhost) {
   function drawObjects(state, boxes, wrong) {
     const left = leftOut(state, state.shown);
     const spots = spotsOf(state);
+    const searched = searchedOf(state);
     const focused = node.contains(document.activeElement) ? document.activeElement : null;
     const ordered = [...boxes].sort((a, b) => a.z - b.z || b.size.x * b.size.y - a.size.x * a.size.y);
     const each = objects.selectAll('g.object').data(ordered, (box) => box.id).join((enter) => {
@@ -97,6 +99,8 @@ export function createBoard(node, store, actions, takeGhost) {
       g.append('rect').attr('class', 'box');
       g.append('title');
       g.on('focus', (_, box) => actions.select(box.id))
+        .on('pointerenter', (_, box) => labels.point(box.id))
+        .on('pointerleave', () => labels.point(null))
         .on('keydown', (event, box) => (event.key === 'Enter' ? openAt(event, box) : actions.keys(event, box.id)))
         .on('contextmenu', (event, box) => openAt(event, box))
         .on('dblclick', (event, box) => openAt(event, box));
@@ -109,17 +113,19 @@ export function createBoard(node, store, actions, takeGhost) {
       .classed('new', (box) => Boolean(state.draft?.fresh.has(box.id)))
       .classed('doubtful', (box) => !state.draft && isDoubtful(wrong.get(box.id)))
       .classed('spot', (box) => spots.has(box.id))
+      .classed('searched', (box) => searched.has(box.id))
+      .style('--share', (box) => (spots.has(box.id) ? `${Math.round(PALE + (DEEP - PALE) * spots.get(box.id))}%` : null))
       .classed('anchor', (box) => state.at?.object === box.id)
       .classed('loose', (box) => !state.draft && state.posed && !box.placed)
       .attr('transform', (box) => `translate(${view.across(box.y)},${view.down(box.x)}) rotate(${-box.yaw})`)
       .attr('aria-pressed', (box) => String(box.id === state.selected))
       .attr('aria-haspopup', 'menu')
-      .attr('aria-label', (box) => described(box, state, boxes, wrong));
+      .attr('aria-label', (box) => described(box, state, boxes, wrong, spots, searched));
     each.select('rect.box')
       .attr('width', (box) => box.size.y * view.scale).attr('height', (box) => box.size.x * view.scale)
       .attr('x', (box) => (-box.size.y / 2) * view.scale).attr('y', (box) => (-box.size.x / 2) * view.scale)
       .attr('rx', (box) => (box.size === UNKNOWN_SIZE ? ROUND : Math.min(5, (Math.min(box.size.x, box.size.y) * view.scale) / 4)));
-    each.select('title').text((box) => described(box, state, boxes, wrong));
+    each.select('title').text((box) => described(box, state, boxes, wrong, spots, searched));
     if (focused && focused !== document.activeElement && focused.isConnected) focused.focus();
   }
 
@@ -129,39 +135,23 @@ export function createBoard(node, store, actions, takeGhost) {
     actions.open(box.id, event.currentTarget, pointer);
   }
 
-  /** Draws labels inside their boxes if they fit, else beside them. Upper objects take precedence. */
+  /** The name of a box on the board: its label, with its id if another box has the label too, or how a model reads it. */
+  function labelOf(box, boxes, state) {
+    const read = state.draft ? [] : reading(state, state.shown, 'objects', box.label);
+    if (read.length > 1) return inWords(read); // A guess names its class.
+    return boxes.some(({ id, label }) => label === box.label && id !== box.id) ? nameOf(box) : box.label;
+  }
+
   function drawLabels(state, boxes, places, wrong) {
-    const texts = [];
     const half = ROBOT_SIDE / 2;
-    const named = (box) => (boxes.some(({ id, label }) => label === box.label && id !== box.id) ? nameOf(box) : box.label);
     const { x, y } = state.viewer;
+    const [spots, searched] = [spotsOf(state), searchedOf(state)];
+    const about = ({ id }) => [spots.has(id) ? percent(spots.get(id)) : '', searched.has(id) ? '✓' : ''].filter(Boolean);
     places.reserve({ left: view.across(y + half), right: view.across(y - half), top: view.down(x + half), bottom: view.down(x - half) });
-    const marks = boxes.filter((box) => !state.draft && wrong.get(box.id)?.is_outlier);
-    for (const box of marks) {
-      const { right: at, top } = onScreen(box, view);
-      places.reserve({ left: at - MARK, right: at + MARK, top: top - MARK, bottom: top + MARK });
-    }
-    for (const box of [...boxes].sort((a, b) => b.z - a.z || a.size.x * a.size.y - b.size.x * b.size.y)) {
-      const read = state.draft ? [] : reading(state, state.shown, 'objects', box.label);
-      const words = read.length > 1 ? inWords(read) : named(box); // A guess names its class.
-      const width = widthOf(words, FONT) + 6;
-      const rect = onScreen(box, view);
-      const at = places.take(width, LINE, labelPlaces(rect, width), [rect]);
-      if (at) texts.push({ id: box.id, words, ...at, wrong: !state.draft && wrong.get(box.id)?.is_outlier });
-    }
-    labels.selectAll('text.name').data(texts, (text) => text.id).join('text')
-      .attr('class', 'name').attr('x', (text) => text.x).attr('y', (text) => text.y)
-      .classed('outlier', (text) => Boolean(text.wrong)).text((text) => text.words);
-    const each = labels.selectAll('g.mark').data(marks, (box) => box.id).join((enter) => {
-      const g = enter.append('g').attr('class', 'mark');
-      g.append('circle').attr('r', MARK);
-      g.append('text').attr('class', 'sign').text('!');
-      return g;
-    });
-    each.attr('transform', (box) => {
-      const rect = onScreen(box, view);
-      return `translate(${rect.right},${rect.top})`;
-    });
+    labels.draw(boxes.map((box) => ({
+      box, words: [shown(labelOf(box, boxes, state), MOST_LETTERS), ...about(box)].join(' '),
+      isWrong: !state.draft && Boolean(wrong.get(box.id)?.is_outlier), first: spots.has(box.id),
+    })), view, places, state.selected);
   }
 
   function draw(state) {
@@ -199,7 +189,7 @@ export function createBoard(node, store, actions, takeGhost) {
   };
 }
 
-function described(box, state, boxes, wrong) {
+function described(box, state, boxes, wrong, spots, searched) {
   const parts = [nameOf(box), whereabouts(box.x, box.y, state.viewer)];
   const below = boxes.find(
     (other) => other.id !== box.id && box.z > 0.05 && Math.abs(other.z + other.size.z - box.z) < 0.03 &&
@@ -208,6 +198,7 @@ function described(box, state, boxes, wrong) {
   if (below) parts.push(`on ${nameOf(below)}`);
   if (!state.draft && wrong.get(box.id)?.is_outlier) parts.push('does not belong here');
   if (!state.draft && isDoubtful(wrong.get(box.id))) parts.push('probably a wrong detection');
-  if (spotsOf(state).has(box.id)) parts.push(`possible place of ${state.where.wanted}`);
+  if (spots.has(box.id)) parts.push(`possible place of ${shown(state.where.wanted)}: ${percent(spots.get(box.id))}`);
+  if (searched.has(box.id)) parts.push('searched');
   return parts.join(', ');
 }

@@ -1,31 +1,17 @@
 /** The answers as text: one column per question and model. */
 
 import { curl, python } from './calls.js';
-import { bar, copy, el, redraw } from './dom.js';
-import { isDoubtful, judgedBy } from './edges.js';
+import { copy, el, redraw } from './dom.js';
 import { accept, ghostsOf, likely, SHIFTED } from './ghosts.js';
 import { common, inWords, QUESTIONS, reading, whyNot } from './questions.js';
-import { newLine } from './records.js';
+import { classOf, createFolds, reasons, row, some, spoken, verdict } from './rows.js';
 import { changed } from './store.js';
-import { namesOf, percent, resolvedWords, SPOKEN, wordOf } from './words.js';
+import { namesOf, percent, shown, SPOKEN, wordOf } from './words.js';
+import { wrongRows } from './wrong.js';
 
 const SEEN = ['answers', 'shown', 'models', 'things', 'tab', 'draft', 'words', 'at', 'posed', 'relations', 'room', 'right', 'line', 'covered'];
 
 const PLACES = 2; // listed places of a missing object, likeliest first
-
-const spoken = ({ subject, relation, object }, name) => `${name(subject)} ${SPOKEN[relation]} ${name(object)}`;
-
-/** Reasons in words: "bed, lamp speak for it; oven speaks against it". What raises the log-odds of an outlier speaks against it. */
-function reasons(because, name, { company = [], raised = 1 } = {}) {
-  const speak = (side, objects) =>
-    objects.length ? `${objects.join(', ')} ${objects.length > 1 ? 'speak' : 'speaks'} ${side} it` : '';
-  const named = (sign) => because.filter((one) => sign * raised * one.log_odds_change > 0).map(({ object }) => name(object));
-  const words = [
-    company.length ? `usually seen with ${company.join(', ')}` : '',
-    speak('for', named(1)), speak('against', named(-1)),
-  ].filter(Boolean).join('; ');
-  return words ? el('p', { class: 'quiet reasons' }, words) : null;
-}
 
 /** What a model did with unknown names, and the warnings of its answer. */
 function notes({ warnings = [] }, state, column, name, question) {
@@ -34,58 +20,17 @@ function notes({ warnings = [] }, state, column, name, question) {
     ...[...names, reading(state, column, 'rooms', state.room)].map(inWords).filter(Boolean).map((words) => (words.endsWith('?') ? words : `${words}.`)),
     // The list of outliers shows the split of the objects.
     ...warnings.filter(({ code }) => code !== 'several-rooms' || question !== 'outliers').map(({ objects, message }) =>
-      (objects.length ? `Check ${objects.map(name).join(', ')}: ${message}.` : `Note: ${message}.`)),
+      (objects.length ? `Check ${some(objects.map(name))}: ${message}.` : `Note: ${message}.`)),
   ].join(' ');
 }
 
 /** Whether the model answers a question: the training scenes of a model may have no relations. */
 const judges = (answer) => !answer?.warnings?.some(({ code }) => code === 'not-judged');
 
-export const row = (kind, words, probability, flag, ...more) =>
-  el('li', { class: flag.kind ?? '' },
-    el('div', { class: 'headline' }, words, flag.words ? el('span', { class: 'flag' }, flag.words) : null,
-      el('span', {}, `${percent(probability)}${flag.unit ?? ''}`), ...(flag.buttons ?? [])),
-    bar(probability, kind), ...more);
-
-/** A button that confirms an answer. The name of its object follows the visible words. */
-export const verdict = (words, about, onclick) => el('button', {
-  type: 'button', class: 'verdict', 'data-key': `${words} ${about}`, 'aria-label': `${words}: ${about}`,
-  // The second click of a double click would hit the next row.
-  onclick: ({ detail }) => detail < 2 && onclick(),
-}, words);
-
-/** The class of an entry, if the request has another word for it. */
-const classOf = ({ label, listed_as: word }) => (word ? el('p', { class: 'quiet' }, `class: ${label}`) : null);
-
-/** Whether a person has confirmed an entry, or the same habit elsewhere. */
-const confirmedWords = ({ confirmed, covered_by: by }, name) => (by ? `✓ covered by ${name(by)}` : confirmed ? 'confirmed' : '');
-
-/** The labels of an object with alternatives, as the other objects decide. */
-function labelsOf({ resolved }, { object }) {
-  const found = resolved?.find((one) => one.object === object);
-  return found ? el('p', { class: 'quiet' }, `labels: ${resolvedWords(found)}`) : null;
-}
-
-/** The objects of each room, if they are probably from several rooms. */
-function split({ warnings = [] }, name, store) {
-  const rooms = warnings.find(({ code }) => code === 'several-rooms')?.rooms ?? [];
-  if (!rooms.length) return [];
-  const parts = rooms.map(({ room_type: room, objects }) => el('li', {},
-    el('div', { class: 'headline' }, el('b', {}, `${room} (${objects.length})`), verdict('Only these', room, () => keepOnly(store, room, objects))),
-    el('p', { class: 'quiet' }, objects.map(name).join(', '))));
-  return [el('li', { class: 'rooms' },
-    el('p', {}, `The objects are probably from ${rooms.length} rooms, but the answers are about one room.`), el('ul', {}, ...parts))];
-}
-
-/** Leaves the objects of one room on the board, as a new scene. Undo brings the others back. */
-function keepOnly(store, room, objects) {
-  const { things, relations } = store.get();
-  const kept = new Set(objects);
-  store.edit({
-    things: things.filter(({ id }) => kept.has(id)).map(({ source, ...thing }) => thing),
-    relations: relations.filter(({ subject, object }) => kept.has(subject) && kept.has(object)),
-    room, selected: null, at: null, line: newLine(), right: [],
-  });
+/** Says why missing objects have no reasons: only objects that change the odds by a factor of 3 are reasons. */
+function unexplained({ missing }, { room }) {
+  if (!missing.length || missing.some(({ because = [] }) => because.length)) return '';
+  return `No single object decides these: ${room ? 'the room type and all objects together do' : 'all objects together do'}.`;
 }
 
 const ROWS = {
@@ -117,32 +62,7 @@ const ROWS = {
     return [...rows, ...further].sort(([a], [b]) => b - a).map(([, node]) => node);
   },
 
-  outliers(found, name, state, store, column, verdicts) {
-    const answer = judgedBy(state.answers[column], state) ?? found;
-    const objects = answer.outliers.map((one) =>
-      row('outliers', el('button', {
-        type: 'button', class: 'link', 'data-key': `of-${one.object}`,
-        onclick: () => store.set({ selected: one.object }),
-      }, name(one.object)), isDoubtful(one) ? one.real : one.probability, one.is_outlier
-        ? { kind: 'alarm', words: 'does not belong', buttons: [verdict('Belongs here', name(one.object), () => verdicts.belongs(one.object))] }
-        : isDoubtful(one) ? { words: 'probably a wrong detection', unit: ' real' } : { words: confirmedWords(one, name) },
-      labelsOf(answer, one) ?? classOf(one),
-      // The reasons are about the place in the scene, not about the detector.
-      isDoubtful(one) ? null : reasons(one.because, name, { company: one.usually_with, raised: -1 })));
-    const misplaced = answer.misplaced.filter((one) => one.is_misplaced || one.confirmed).map((one) =>
-      row('outliers', el('b', {}, spoken(one, name)), one.probability, one.confirmed
-        ? { words: confirmedWords(one, name) }
-        : { kind: 'alarm', words: 'in the wrong place', buttons: [verdict('Stands right', spoken(one, name), () => verdicts.standsRight(one))] },
-        one.moved == null ? null : el('p', { class: 'quiet' }, `moved: ${name(one.moved)}`),
-        one.confirmed && !isLearnt(one) ? el('p', { class: 'quiet' }, NOT_LEARNT) : null));
-    const stated = state.posed || state.relations.length;
-    const order = answer.outliers.map((one) => (one.is_outlier ? 0 : isDoubtful(one) ? 1 : 2));
-    const of = (rank) => objects.filter((_, index) => order[index] === rank);
-    return [
-      ...split(answer, name, store), ...of(0), ...misplaced, ...of(1), ...of(2),
-      stated ? null : el('li', { class: 'quiet' }, 'Places are not judged, because positions do not count as evidence.'),
-    ].filter(Boolean);
-  },
+  outliers: wrongRows,
 
   relations: ({ disagreements, relations }, name) => [
     ...disagreements.map((one) =>
@@ -157,10 +77,6 @@ const ROWS = {
         one.expected == null ? null : el('p', { class: 'quiet' }, `if not observed: ${percent(one.expected)}`))),
   ],
 };
-
-/** Whether adapt learns a confirmed relation (training/domain/home.py). */
-const isLearnt = ({ relation, object }) => object !== 'floor' && !['left', 'right', 'front', 'behind'].includes(relation);
-const NOT_LEARNT = 'An adapted model reports this again: adapt learns which objects support others, not places on the floor or beside objects.';
 
 const NOTHING = {
   missing: 'The model suggests no object.',
@@ -201,7 +117,7 @@ export function problemWords(problem, body) {
   const errors = (problem.errors ?? []).map(({ pointer, message, suggestions = [] }) => {
     const [, field, index] = /^#\/(objects|rooms|label)(?:\/(\d+))?/.exec(pointer) ?? [];
     const about = field === 'label' ? body?.label : body?.[field]?.[index]?.id;
-    return el('li', {}, `${about ? `${about}: ` : ''}${message}${suggestions.length ? ` (${suggestions.join(', ')}?)` : ''}`);
+    return el('li', {}, `${about ? `${shown(about)}: ` : ''}${message}${suggestions.length ? ` (${suggestions.join(', ')}?)` : ''}`);
   });
   return [
     el('b', {}, problem.title), el('p', {}, problem.detail ?? ''),
@@ -212,6 +128,7 @@ export function problemWords(problem, body) {
 
 export function createColumns(store, parents, askKey, verdicts) {
   const made = new Map();
+  const folds = createFolds();
   for (const question of QUESTIONS) {
     for (const column of [0, 1]) {
       const own = {
@@ -241,13 +158,14 @@ export function createColumns(store, parents, askKey, verdicts) {
     }
     own.told = problem;
     const name = namesOf(state.things);
-    const rows = answer ? ROWS[question](answer, name, state, store, column, verdicts) : [];
+    const rows = answer ? ROWS[question](answer, name, state, store, column, verdicts, folds) : [];
     redraw(own.rows, rows);
     const waiting = status === 'down' ? 'Waiting for the service.' : whyNot(state, question, model);
     const shared = question === 'missing' && column === 0 && common(state);
     own.note.textContent = [
       question === 'outliers' && answer?.threshold !== undefined ? `An object raises an alarm from ${percent(answer.threshold)}.` : '',
       shared ? `Both models answer about their ${shared.length} common classes.` : '',
+      question === 'missing' && answer ? unexplained(answer, state) : '',
       notes(answer ?? {}, state, column, name, question), rows.length || !judges(answer) ? '' : answer ? NOTHING[question] : waiting,
     ].filter(Boolean).join(' ');
     own.calls.show(question, entry.body);
@@ -255,6 +173,7 @@ export function createColumns(store, parents, askKey, verdicts) {
 
   return (state, previous) => {
     if (!changed(state, previous, ...SEEN)) return;
+    if (state.line.scene_id !== previous.line?.scene_id) folds.clear();
     for (const question of QUESTIONS) {
       for (const column of [0, 1]) {
         const busy = state.answers[column][question]?.status === 'asking';

@@ -39,8 +39,8 @@ export async function copy(text) {
   area.remove();
 }
 
-/** A bar that shows a probability. */
-export function bar(probability, kind = '') {
+/** A bar that shows a probability, with a tick at its former value. */
+export function bar(probability, kind = '', was = null) {
   const svg = document.createElementNS('http://www.w3.org/2000/svg', 'svg');
   svg.setAttribute('class', `bar ${kind}`);
   svg.setAttribute('aria-hidden', 'true');
@@ -48,5 +48,12 @@ export function bar(probability, kind = '') {
   rect.setAttribute('width', `${100 * probability}%`);
   rect.setAttribute('height', '100%');
   svg.append(rect);
+  if (was !== null) {
+    const tick = rect.cloneNode();
+    tick.setAttribute('class', 'was');
+    tick.setAttribute('x', `${100 * was}%`);
+    tick.setAttribute('width', 2);
+    svg.append(tick);
+  }
   return svg;
 }

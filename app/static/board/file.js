@@ -3,18 +3,19 @@
 import { call, ProblemError, UnreachableError } from './api.js';
 import { copy } from './dom.js';
 import { asRequest, ownScenes } from './importing.js';
+import { countOf } from './notes.js';
 import { linesOf } from './records.js';
 import { sizesOf } from './questions.js';
 import { SceneError, toScene } from './scene.js';
 import { toHash } from './share.js';
+import { shown } from './words.js';
 
-const SOME = 3; // notes that the page shows
 const MOST_BYTES = 64 * 2 ** 20; // of a file
 const MOST_SHOWN = 2 ** 20; // bytes; a browser needs a minute to show a text of 50 MB
 
 /**
  * @typedef {{name: string, scene: object, notes?: object[]}} Found a scene of a text. Only scenes that the service has read have notes
- * @param {(scene: object, notes: string, line: object | undefined) => void} put puts a scene on the board; throws SceneError
+ * @param {(scene: object, notes: object[], line: object | undefined) => void} put puts a scene on the board; throws SceneError
  * @param {(scenes: Found[], index: number, isNew: boolean) => void} whenPlaced gets the scenes of a text and the number of that on the board
  * @returns {{place: (index: number) => void}} puts another scene of the opened text on the board
  */
@@ -55,7 +56,7 @@ export function fileDialog(store, records, recorded, put, say, whenPlaced) {
   }
 
   function nameScene() {
-    get('scenes').textContent = found ? `of ${found.length}: ${found[chosen()].name}` : '';
+    get('scenes').textContent = found ? `of ${found.length}: ${shown(found[chosen()].name)}` : '';
   }
 
   /** The scenes of a text in another format than that of requests. The service reads it and stores nothing. */
@@ -64,12 +65,6 @@ export function fileDialog(store, records, recorded, put, say, whenPlaced) {
     const { scenes, notes } = await call('scenes', { text, name: name.slice(-255) || 'text', ...(labels && { label_map: labels }) });
     const about = (index) => notes.filter((note) => note.scene === index);
     return scenes.map((one, index) => ({ ...one, notes: [...about(null), ...about(index)] }));
-  }
-
-  /** The text of the notes on values that the scene leaves out. */
-  function inWords(notes) {
-    const words = notes.slice(0, SOME).map(({ detection, detail }) => (detection === null ? detail : `detection ${detection}: ${detail}`));
-    return words.length ? `The file was read with notes: ${words.join('; ')}${notes.length > SOME ? '; …' : '.'}` : '';
   }
 
   /** Shows the buttons of the confirmed scenes if there are any. */
@@ -86,7 +81,7 @@ export function fileDialog(store, records, recorded, put, say, whenPlaced) {
     name = file?.name ?? '';
     hidden = isLarge ? text : '';
     area.value = isLarge ? '' : text;
-    done.textContent = isLarge ? `${file.name} is open. It is too large to be shown here.` : '';
+    done.textContent = isLarge ? `${shown(file.name)} is open. It is too large to be shown here.` : '';
     look();
   }
 
@@ -140,12 +135,12 @@ export function fileDialog(store, records, recorded, put, say, whenPlaced) {
     }
     const lines = notes ? [] : linesOf(text.scenes, text.name);
     const line = lines.length ? records.open(lines, text.name)[index] : undefined;
-    put(asRequest(line ?? given), inWords(notes ?? []), line);
+    put(asRequest(line ?? given), notes ?? [], line);
     whenPlaced(text.scenes, index, opened !== text);
     opened = text;
     recorded.open(lines, index);
     const count = text.scenes.length;
-    say(count > 1 ? `Scene ${index + 1} of ${count} is on the board.` : 'The scene is on the board.');
+    say(`${count > 1 ? `Scene ${index + 1} of ${count}` : 'The scene'} is on the board. ${countOf(notes ?? [])}`.trim());
   }
   get('download').addEventListener('click', () => save(source(), 'scene.json'));
   get('download-scenes').addEventListener('click', () => save(records.text(), records.name()));

@@ -6,7 +6,7 @@ import { el, redraw } from './dom.js';
 import { isDoubtful } from './edges.js';
 import { isCertain, readings } from './questions.js';
 import { changed } from './store.js';
-import { nameOf, resolvedWords } from './words.js';
+import { nameOf, resolvedWords, shown } from './words.js';
 
 const SEEN = ['things', 'selected', 'answers', 'shown', 'viewer', 'draft', 'models', 'posed', 'line', 'covered', 'room', 'right'];
 
@@ -41,7 +41,7 @@ export function createList(list, empty, count, actions) {
 
   /** How a model reads an unknown label. Each similar label is a button that renames the object. */
   const suggested = ({ id, label }, [words, ...names]) => el('p', {}, words, ...names.flatMap((name) => [' ', el('button', {
-    type: 'button', class: 'link', 'data-key': name, 'aria-label': `Rename ${label} to ${name}`,
+    type: 'button', class: 'link', 'data-key': name, 'aria-label': `Rename ${shown(label)} to ${name}`,
     onclick: () => actions.rename(id, name),
   }, `${name}?`)]));
 

@@ -1,5 +1,6 @@
 /** Connects the parts of the page. */
 
+import { createAbout } from './about.js';
 import { createActions } from './actions.js';
 import { useKey, UnreachableError } from './api.js';
 import { startAsking } from './asking.js';
@@ -14,6 +15,7 @@ import { layOut } from './layout.js';
 import { createList } from './list.js';
 import { createModels } from './models.js';
 import { createProperties } from './properties.js';
+import { createNotes } from './notes.js';
 import { hangingOf, sizesOf } from './questions.js';
 import { watchService } from './recovery.js';
 import { fromScene, SceneError, sizer } from './scene.js';
@@ -64,6 +66,7 @@ function put(scene, change = {}, line = newLine()) {
     viewer, room, selected: null, at: null, draft: null, ...change,
   });
   note(foreign);
+  showNotes([]);
 }
 
 function note(words) {
@@ -116,7 +119,8 @@ function askKey() {
   }, el('label', {}, 'API key ', input), el('button', {}, 'Use it'));
 }
 
-const actions = createActions(store, say, get('menu'));
+const showNotes = createNotes(get('file-notes'), get('open-file'));
+const actions = createActions(store, say, get('menu'), (id) => where.menuOf(id));
 const takeGhost = (ghost) => {
   const id = accept(store, ghost);
   if (!id) return;
@@ -147,6 +151,7 @@ const views = [
   tabs(document.querySelector('[role=tablist]'), store),
   where.render,
   settings(store),
+  createAbout(store, get('about')),
   listExamples,
   (state, previous) => changed(state, previous, 'line', 'things', 'right', 'answers', 'shown', 'covered') && showRecords(),
 ];
@@ -177,7 +182,7 @@ const records = createRecords(store, showRecords, sender);
 const recorded = createRecorded(store, records, (index) => file.place(index));
 const file = fileDialog(store, records, recorded, (scene, notes, line) => {
   put(scene, {}, line);
-  if (notes) note(`${get('note').textContent} ${notes}`.trim());
+  showNotes(notes);
   if (!store.get().down) get('banner').hidden = true; // such as that of a broken link
 }, say, (scenes, index, isNew) => {
   if (isNew) where.useRooms(roomsOf(scenes, records));
@@ -220,6 +225,7 @@ function undo() {
 get('undo').addEventListener('click', undo);
 get('clear').addEventListener('click', () => {
   note('');
+  showNotes([]);
   store.edit({ things: [], relations: [], room: '', selected: null, at: null, draft: null, line: newLine(), right: [] });
 });
 document.addEventListener('keydown', (event) => {

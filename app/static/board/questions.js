@@ -1,6 +1,7 @@
 /** The bodies of the questions that the page asks about every scene. */
 
 import { toScene } from './scene.js';
+import { shown } from './words.js';
 
 /** The questions with a tab of their own. */
 export const QUESTIONS = ['missing', 'outliers', 'relations'];
@@ -94,11 +95,11 @@ export const isCertain = (state, name) => Boolean(state.answers) && mappedBy(sta
 export function reading(state, column, kind, name) {
   const left = leftOut(state, column);
   const names = kind === 'rooms' ? [name] : state.things.filter(({ label }) => label === name).map(({ id }) => id);
-  if (names.some((one) => left.has(one))) return [`${name} not known, left out`];
+  if (names.some((one) => left.has(one))) return [`${shown(name)} not known, left out`];
   const found = mappedBy(state, column, name);
   if (!found) return [];
-  if (found.rule === 'meaning') return [`${name} read by its meaning, like ${found.class}`];
-  return found.similarity < 1 ? [`${name} →`, found.class] : [`${name} → ${found.class}`];
+  if (found.rule === 'meaning') return [`${shown(name)} read by its meaning, like ${found.class}`];
+  return found.similarity < 1 ? [`${shown(name)} →`, found.class] : [`${shown(name)} → ${found.class}`];
 }
 
 /** A reading as text: "fridgee → fridge?". */

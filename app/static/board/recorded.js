@@ -10,6 +10,7 @@ import { asRequest } from './importing.js';
 import { sizesOf, UNKNOWN_LABELS } from './questions.js';
 import { fromScene, toScene } from './scene.js';
 import { changed } from './store.js';
+import { shown } from './words.js';
 
 const AT_ONCE = 64; // scenes in a batch, so that other clients wait a few milliseconds only
 
@@ -109,7 +110,7 @@ export function createRecorded(store, records, go) {
       return;
     }
     const known = alarms.length < lines.length ? `${alarms.length} of ${lines.length} scenes asked. ` : '';
-    status.textContent = `${known}${confirmed}${open} of ${lines.length} scenes with an open alarm. On the board: ${lines[current].scene_id}.`;
+    status.textContent = `${known}${confirmed}${open} of ${lines.length} scenes with an open alarm. On the board: ${shown(lines[current].scene_id)}.`;
     lines.forEach((line, index) => {
       const words = nameOf(line, index);
       if (list.options[index].textContent !== words) list.options[index].textContent = words;
@@ -118,7 +119,7 @@ export function createRecorded(store, records, go) {
   }
 
   function nameOf(line, index) {
-    return [index + 1, line.room_type, about(line, index), line.scene_id].filter(Boolean).join(' · ');
+    return [index + 1, ...[line.room_type, about(line, index), line.scene_id].filter(Boolean).map((part) => shown(part))].join(' · ');
   }
 
   function about(line, index) {

@@ -1,7 +1,7 @@
 /** Conversion between the board and a scene of the API. */
 
 import { halves, radians, round, UNKNOWN_SIZE } from './geometry.js';
-import { SPOKEN } from './words.js';
+import { shown, SPOKEN } from './words.js';
 
 /** @typedef {import('./store.js').Thing} Thing */
 
@@ -138,8 +138,8 @@ function readRelation(things) {
     const [subject, relation, object] = (Array.isArray(found) ? found : [found.subject, found.relation, found.object]).map(asId);
     fail(!Object.hasOwn(SPOKEN, relation), `${where} must be one of ${Object.keys(SPOKEN).join(', ')}.`);
     for (const name of [subject, object]) {
-      fail(!names.has(name), `${where} names an object outside the scene: ${name}.`);
-      fail(names.get(name) === null, `${where} needs an id, because several objects have the label ${name}.`);
+      fail(!names.has(name), `${where} names an object outside the scene: ${shown(name)}.`);
+      fail(names.get(name) === null, `${where} needs an id, because several objects have the label ${shown(name)}.`);
     }
     return { subject: names.get(subject), relation, object: names.get(object) };
   };
@@ -166,7 +166,7 @@ function readThing(entry, id, index, before, sizes) {
   fail(!found || typeof found !== 'object', `${where} must be a label or a JSON object.`);
   fail(typeof found.label !== 'string' || !found.label.trim(), `${where} needs a label.`);
   fail(typeof id !== 'string' || !id.trim() || id.startsWith('\u0000'), `${where} has an id that is not a text.`);
-  fail(before.some((thing) => thing.id === id), `${where} has the id of another object: ${id}.`);
+  fail(before.some((thing) => thing.id === id), `${where} has the id of another object: ${shown(id)}.`);
   const { position, size: extents, orientation: q } = found;
   const confidence = found.confidence ?? 1;
   fail(position && !AXES.every((axis) => isPlace(position[axis])), `${where} needs a position with numbers x, y, z within ±100 000 km.`);

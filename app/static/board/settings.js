@@ -7,15 +7,15 @@ import { UNKNOWN_SIZE } from './geometry.js';
 import { ghostsOf } from './ghosts.js';
 import { inWords, isCertain, leftOut, mappedBy, readings, sizesOf } from './questions.js';
 import { sizer } from './scene.js';
-import { spotsOf } from './spots.js';
+import { searchedOf, spotsOf } from './spots.js';
 import { changed } from './store.js';
-import { namesOf, percent, plain, SPOKEN } from './words.js';
+import { namesOf, percent, plain, shown, SPOKEN } from './words.js';
 
 const get = (id) => document.getElementById(id);
 
 /** The symbols of the board in words; the legend lists those that are visible. */
 const SYMBOLS = {
-  robot: 'robot and the direction it looks in', selected: 'selected', outlier: 'does not belong', doubtful: 'probably a wrong detection', spot: 'possible place of the thing',
+  robot: 'robot and the direction it looks in', selected: 'selected', outlier: 'does not belong', doubtful: 'probably a wrong detection', spot: 'possible place of the thing', searched: '✓ searched',
   unknown: 'not known to the model, left out', guess: 'size not known', loose: 'position not given', anchor: 'place of the question', ghost: 'suggestion: click to add it',
   misplaced: 'probably in the wrong place', holds: 'observed', expected: 'expected',
   disagrees: 'expected instead of what is observed', fresh: 'generated', drawn: 'relation',
@@ -26,7 +26,7 @@ function visible(state) {
   const edges = new Set(edgesOf(state).map(({ kind }) => kind));
   const seen = {
     robot: true, selected, outlier: [...outliersOf(state).values()].some((one) => one.is_outlier),
-    doubtful: [...outliersOf(state).values()].some(isDoubtful), spot: spotsOf(state).size,
+    doubtful: [...outliersOf(state).values()].some(isDoubtful), spot: spotsOf(state).size, searched: searchedOf(state).size,
     unknown: things.some(({ id }) => leftOut(state, state.shown).has(id)),
     guess: [...things.map(sizer(sizesOf(state, state.models[0]))), ...ghostsOf(state)].some(({ size }) => size === UNKNOWN_SIZE),
     loose: posed && things.some(({ placed }) => !placed), anchor: at, ghost: ghostsOf(state).length,
@@ -68,7 +68,7 @@ export function settings(store) {
     const likely = new Map(answer.map((one) => [plain(one.room_type), one.probability]));
     const probability = (room) => likely.get(plain(room)) ?? likely.get(plain(mappedBy(state, state.shown, room)?.class ?? ''));
     all.sort((a, b) => (probability(b) ?? 0) - (probability(a) ?? 0));
-    const words = (room) => (probability(room) === undefined ? room : `${room} ${percent(probability(room))}`);
+    const words = (room) => (probability(room) === undefined ? shown(room) : `${shown(room)} ${percent(probability(room))}`);
     get('room').replaceChildren(el('option', { value: '' }, 'unknown'), ...all.map((room) => el('option', { value: room }, words(room))));
     get('room').value = state.room;
     get('room').parentElement.hidden = !all.length;

@@ -2,18 +2,18 @@
 
 import { call, ProblemError, UnreachableError } from './api.js';
 import { combobox } from './combobox.js';
-import { calls, problemWords, row, verdict } from './columns.js';
+import { calls, problemWords } from './columns.js';
 import { el, redraw } from './dom.js';
 import { asRequest } from './importing.js';
 import { UNKNOWN_LABELS } from './questions.js';
 import { fromScene, SceneError, toScene } from './scene.js';
-import { nowhere, placesOf, thingAt } from './spots.js';
+import { isOnBoard, nowhere, thingAt } from './spots.js';
 import { changed } from './store.js';
-import { namesOf, percent, plain, SPOKEN, wordOf } from './words.js';
+import { hereWords, placeRows, placeWords, roomRows, searchChips } from './where_rows.js';
+import { percent, plain, shown, wordOf } from './words.js';
 
 const MOST_ROOMS = 32; // of the service
-const PLACES = 10;
-const ROOMS = 6; // shown rooms, likeliest first
+const PLACES = 256; // of the answer; the board sums the places of an object
 
 /** The objects of a scene without positions: the rooms of a file have no common axes. */
 const objectsOf = (scene) => toScene({ relations: [], room: '', ...scene, posed: false }, new Map()).objects;
@@ -54,10 +54,12 @@ export function createWhere(panel, store, say, go) {
   const own = {
     title: el('h3'), again: el('button', { type: 'button', onclick: startAgain }, 'Start again'),
     problem: el('div', { class: 'problem', role: 'alert', hidden: true }), note: el('p', { class: 'quiet' }),
+    searched: el('ul', { class: 'chips', 'aria-label': 'Searched without finding it' }),
     places: el('ol', { 'aria-label': 'Places' }), rooms: el('ul', { 'aria-label': 'Rooms' }), calls: calls(),
   };
-  const more = el('h4', {}, 'Rooms');
-  article.append(el('header', {}, own.title, own.again), own.problem, own.note, own.places, more, own.rooms, own.calls.node);
+  const [roomsTitle, placesTitle] = [el('h4', {}, 'Rooms'), el('h4', {}, 'Places')];
+  article.append(el('header', {}, own.title, own.again), own.problem, own.note, own.searched, roomsTitle, own.rooms, placesTitle, own.places, own.calls.node);
+  const here = document.getElementById('here');
   let controller = new AbortController();
 
   const update = (change) => store.set({ where: { ...store.get().where, ...change } });
@@ -74,30 +76,31 @@ export function createWhere(panel, store, say, go) {
   const withBoard = ({ where: { rooms }, line, things }) => rooms.map((room) => (
     room.index !== undefined && room.scene_id === line.scene_id ? { ...room, objects: objectsOf({ things }) } : room));
 
-  async function ask() {
+  /** @param {object | null} before the answer before a search, for comparison */
+  async function ask(before = null) {
     controller.abort();
     controller = new AbortController();
     const { signal } = controller;
     update({ rooms: withBoard(store.get()) });
     const state = store.get();
     if (!state.where.wanted || !state.where.rooms.length) {
-      update({ answer: null, problem: null, status: 'none', body: null });
+      update({ answer: null, before: null, problem: null, status: 'none', body: null });
       return;
     }
     const body = bodyOf(state);
     update({ status: 'asking', body });
     try {
       const answer = await call('where', body, signal);
-      update({ status: 'answered', answer, problem: null });
+      update({ status: 'answered', answer, before, problem: null });
       const [first] = answer.places;
-      say(`${wordOf(answer)}: ${first ? `most likely ${placeWords(first)}, ${percent(first.probability)}. ` : ''}Not here: ${percent(answer.not_here)}.`);
+      say(`${wordOf(answer)}: ${first ? `most likely ${placeWords(first, store.get().where)}, ${percent(first.probability)}. ` : ''}Not here: ${percent(answer.not_here)}.`);
     } catch (error) {
       if (signal.aborted) return;
       if (error instanceof UnreachableError) {
         update({ status: 'down' });
         store.set({ down: true });
       } else if (error instanceof ProblemError) {
-        update({ status: 'refused', answer: null, problem: error.problem });
+        update({ status: 'refused', answer: null, before: null, problem: error.problem });
       } else {
         throw error;
       }
@@ -112,26 +115,24 @@ export function createWhere(panel, store, say, go) {
     void ask();
   }
 
-  function look({ room, object }) {
-    update({ searched: [...store.get().where.searched, { room, ...(object != null && { object }) }] });
-    void ask();
+  /** Changes the searches of the thing. The next answer shows the former probabilities too. */
+  function search(searched) {
+    const { answer } = store.get().where;
+    update({ searched });
+    void ask(answer);
+  }
+
+  const look = ({ room, object }) => search([...store.get().where.searched, { room, ...(object != null && { object }) }]);
+
+  function takeBack(index) {
+    search(store.get().where.searched.filter((_, other) => other !== index));
+    if (!store.get().where.searched.length) get('wanted').focus();
   }
 
   function startAgain() {
     update({ searched: [] });
     get('wanted').focus();
     void ask();
-  }
-
-  /** The name of an object of a room. */
-  function nameIn({ room, object }) {
-    const { objects = [] } = store.get().where.rooms.find((one) => one.name === room) ?? {};
-    return namesOf(objects)(object);
-  }
-
-  function placeWords(place) {
-    if (place.is_listed) return `${place.room}: ${nameIn(place)}, seen there`;
-    return `${place.room}: ${place.object == null ? 'elsewhere' : `${SPOKEN[place.relation]} ${nameIn(place)}`}`;
   }
 
   /** Selects the object of a place. If the board shows another room of the file, it shows this one first. */
@@ -142,33 +143,9 @@ export function createWhere(panel, store, say, go) {
     if (thing) store.set({ selected: thing.id });
   }
 
-  function placeRow(place, state) {
-    const { rooms, searched } = state.where;
-    const words = placeWords(place);
-    const canShow = thingAt(place, state) || rooms.find((one) => one.name === place.room)?.index !== undefined;
-    const title = canShow
-      ? el('button', { type: 'button', class: 'link', 'data-key': `show ${words}`, onclick: () => show(place) }, words)
-      : el('b', {}, words);
-    const looks = searched.filter(({ room, object }) => room === place.room && (object == null || object === place.object)).length;
-    const button = verdict(place.object == null ? 'Looked in the room' : 'Looked there', words, () => look(place));
-    return row('missing', title, place.probability,
-      { words: looks ? `looked${looks > 1 ? ` ${looks}\u00a0times` : ''}` : '', buttons: [button] });
-  }
-
-  function roomRows({ rooms, not_here: outside }) {
-    const shown = rooms.slice(0, rooms.length > ROOMS + 1 ? ROOMS : rooms.length);
-    const others = rooms.slice(shown.length);
-    const sum = others.reduce((total, { probability }) => total + probability, 0);
-    return [
-      ...shown.map(({ room, probability }) => row('relations', el('b', {}, room), probability, {})),
-      ...(others.length ? [row('relations', el('b', {}, `${others.length} other rooms`), sum, {})] : []),
-      row('relations', el('b', {}, 'not here'), outside, {}),
-    ];
-  }
-
   function drawRooms({ where: { rooms } }) {
-    redraw(chips, rooms.map((room) => el('li', {}, room.name, el('span', { class: 'quiet' }, ` ${room.objects.length} `), el('button', {
-      type: 'button', class: 'icon', 'data-key': room.name, 'aria-label': `Remove the room ${room.name}`,
+    redraw(chips, rooms.map((room) => el('li', {}, shown(room.name), el('span', { class: 'quiet' }, ` ${room.objects.length} `), el('button', {
+      type: 'button', class: 'icon', 'data-key': room.name, 'aria-label': `Remove the room ${shown(room.name)}`,
       onclick: () => {
         setRooms(store.get().where.rooms.filter((one) => one.name !== room.name));
         if (store.get().where.rooms.length === 0) name.focus();
@@ -181,7 +158,7 @@ export function createWhere(panel, store, say, go) {
     const { wanted, searched, answer, problem, status, rooms, body } = state.where;
     article.hidden = !wanted;
     article.setAttribute('aria-busy', String(status === 'asking'));
-    own.title.textContent = answer ? wordOf(answer) : wanted;
+    own.title.textContent = shown(answer ? wordOf(answer) : wanted);
     own.again.hidden = !searched.length;
     own.problem.hidden = !problem;
     own.problem.replaceChildren(...(problem ? problemWords(problem, body) : []));
@@ -190,14 +167,15 @@ export function createWhere(panel, store, say, go) {
       answer?.listed_as ? `class: ${answer.label}.` : '', looks,
       rooms.length ? (status === 'down' ? 'Waiting for the service.' : '') : 'Add a room first.',
     ].filter(Boolean).join(' ');
-    redraw(own.places, placesOf(state.where).map((place) => placeRow(place, state)));
-    more.hidden = !answer;
-    redraw(own.rooms, answer ? roomRows(answer) : []);
+    redraw(own.searched, searchChips(state, takeBack));
+    redraw(own.rooms, roomRows(state, (room) => go(room.index)));
+    redraw(own.places, placeRows(state, { show, look }));
+    roomsTitle.hidden = placesTitle.hidden = !answer;
     own.calls.show('where', answer ? body : null);
   }
 
   combobox(get('wanted'), get('wanted-found'), () => store.get().words[store.get().models[0]]?.objects ?? [], (wanted) => {
-    update({ wanted, searched: [], answer: null, problem: null });
+    update({ wanted, searched: [], answer: null, before: null, problem: null });
     void ask();
   });
   form.addEventListener('submit', (event) => {
@@ -210,7 +188,7 @@ export function createWhere(panel, store, say, go) {
     const added = { name: own, scene_id: line.scene_id, objects: objectsOf({ things }), ...(room && room !== own && { room_type: room }) };
     setRooms([...others, added]);
     name.value = '';
-    say(`${own} added with ${things.length} ${things.length === 1 ? 'object' : 'objects'}.`);
+    say(`${shown(own)} added with ${things.length} ${things.length === 1 ? 'object' : 'objects'}.`);
   });
   name.addEventListener('input', () => name.setCustomValidity(''));
   store.subscribe((state, previous) => {
@@ -231,7 +209,18 @@ export function createWhere(panel, store, say, go) {
       update({ ...nowhere(), wanted: store.get().where.wanted });
       setRooms(rooms);
     },
+    /** The entries of the menu of an object: a search without success, if the object is in a room of the home. */
+    menuOf(id) {
+      const state = store.get();
+      const room = state.tab === 'where' && state.where.wanted && state.where.rooms.find((one) => isOnBoard(one, state));
+      const place = room && { room: room.name, object: id };
+      return place && thingAt(place, state) ? [[`Looked here, no ${shown(state.where.wanted)}`, () => look(place)]] : [];
+    },
     render(state, previous) {
+      if (changed(state, previous, 'where', 'things', 'line', 'tab', 'draft')) {
+        here.textContent = hereWords(state);
+        here.hidden = !here.textContent;
+      }
       if (state.room !== previous.room) name.placeholder = state.room || 'kitchen';
       if (state.where.rooms !== previous.where.rooms) drawRooms(state);
       if (changed(state, previous, 'where', 'things', 'line')) drawAnswer(state);

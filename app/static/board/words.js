@@ -2,8 +2,8 @@
 
 /** @typedef {{label: string, aliases: string[], structure: boolean}} Entry */
 
-/** A label for comparisons: in lower case, with single spaces. */
-export const plain = (text) => text.toLowerCase().replace(/[\s_-]+/g, ' ').trim();
+/** A label for comparisons: in lower case, with single spaces. A file may have a number in its place. */
+export const plain = (text) => String(text).toLowerCase().replace(/[\s_-]+/g, ' ').trim();
 
 function rank(name, wanted) {
   if (name === wanted) return 0;
@@ -34,8 +34,23 @@ export function search(entries, text, limit = 12) {
   return found.sort((a, b) => a.best - b.best).slice(0, limit);
 }
 
+const MOST_SHOWN = 48; // characters of a name
+/** Characters that the service refuses in names too: controls, line breaks, directions of text, unusual blanks. */
+const UNPRINTABLE = /[\p{C}\p{Zl}\p{Zp}]|(?! )\p{Zs}/gu;
+const RIGHT_TO_LEFT = /[\u0590-\u08ff\ufb1d-\ufdff\ufe70-\ufefc]/;
+
+/** A text of a request or a file for display: in one line and of bounded length. It turns no text beside it. */
+export function shown(text, most = MOST_SHOWN) {
+  const own = String(text);
+  const line = own.slice(0, 2 * most).replace(UNPRINTABLE, '\ufffd');
+  const letters = [...line];
+  const cut = letters.length > most || line.length < own.length ? `${letters.slice(0, most - 1).join('')}…` : line;
+  return RIGHT_TO_LEFT.test(cut) ? `\u2068${cut}\u2069` : cut; // isolates the direction of the name
+}
+
 /** The name of an object: its id, with its label if the id does not begin with it, as in "desk (track_3)". */
-export const nameOf = ({ id, label }) => (`${plain(id)} `.startsWith(`${plain(label)} `) ? id : `${label} (${id})`);
+export const nameOf = ({ id, label }) => (
+  `${plain(id)} `.startsWith(`${plain(label)} `) ? shown(id) : `${shown(label)} (${shown(id)})`);
 
 /** The word of the request for a class of an answer. */
 export const wordOf = ({ label, listed_as: word }) => word ?? label;
@@ -43,7 +58,7 @@ export const wordOf = ({ label, listed_as: word }) => word ?? label;
 /** A function from the id of an object to its name. */
 export function namesOf(things) {
   const names = new Map(things.map((thing) => [thing.id, nameOf(thing)]));
-  return (id) => names.get(id) ?? id;
+  return (id) => names.get(id) ?? shown(id);
 }
 
 /** Relations in words, for example "on top of". */

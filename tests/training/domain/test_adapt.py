@@ -60,7 +60,7 @@ def test_a_confirmed_object_is_never_reported_again(store, tmp_path):
     scene = {"objects": INTRUDER, "room_type": "bedroom", "confirmed": True}
     assert alarms(default(store), INTRUDER, "bedroom") == ["toilet"]
     output = adapt(store, write([scene], tmp_path / "scenes.jsonl"))
-    assert "never reported from now on: toilet (1)" in output
+    assert "1 exception, never reported from now on: toilet (1)" in output
     assert alarms(home(store), INTRUDER, "bedroom") == []
     parent, adapted_one = stored(store, "default"), stored(store, "home")
     assert adapted_one.manifest.training["parent"]["digest"] == parent.digest
@@ -145,7 +145,7 @@ def test_an_unconfirmed_object_teaches_nothing(store, tmp_path):
     assert "left out, because no person has confirmed them" in output
     assert "toilet (1): id0" in output
     output = adapt(store, write(scenes, tmp_path / "scenes.jsonl"), code=3)
-    assert "toilet (4): id0, id1, id2, ..." in output
+    assert "toilet (4): id0, id1, id2, and 1 more" in output
     assert "nothing was published" in output
     assert store.versions("home") == ()
 

@@ -35,7 +35,8 @@ def scenes_of(*classes: list[int], rooms: list[int] | None = None, size: int = V
     for row, present in zip(v, classes, strict=True):
         row[present] = 1
     observed = torch.ones(len(classes), size, dtype=torch.bool)
-    return HomeScenes(v, observed, torch.tensor(rooms or [-1] * len(classes)))
+    rooms_of = torch.tensor(rooms or [-1] * len(classes))
+    return HomeScenes(v, observed, rooms_of, torch.ones(len(classes)))
 
 
 def probabilities(weights: Weights, *listed: int) -> torch.Tensor:
@@ -102,6 +103,34 @@ def test_a_class_that_the_parent_hardly_knows_is_learnt_from_few_scenes():
     )
     assert common < 0.2
     assert 0.3 < rare < 0.7
+
+
+def test_unrecorded_classes_change_by_their_bias_alone():
+    """Otherwise the home would raise alarms about harmless things that it has not seen yet."""
+    parent = small()
+    home = adapt(parent, scenes_of(*HOME))
+    rest, listed = np.setdiff1d(np.arange(V), [0, 1, 2, 3]), torch.eye(V)[[0, 1]].sum(0, True)
+    before, after = (machine_of(side).object_log_odds(listed)[0] for side in (parent, home))
+    bias = torch.from_numpy(home["b"] - parent["b"])[rest]
+    assert bias.min() < -0.3
+    assert (after - before)[rest] == pytest.approx(bias.numpy(), abs=0.4)
+
+
+def test_a_habit_of_a_room_type_is_learnt_there():
+    """The home has class 4 in most rooms of type 0, and the parent expects it in few rooms."""
+    weights = small().arrays
+    weights["b"] = weights["b"].copy()
+    weights["b"][4] = -6
+    weights["fantasy_rooms"] = (np.arange(40) % C).astype(np.int32)
+    parent = Weights(small().spec, weights)
+    home = [[0, 1, 4], [0, 2, 4], [0, 1, 2], [1, 2], [2, 3], [1, 3]] * 4
+    adapted = adapt(parent, scenes_of(*home, rooms=[0, 0, 0, 1, 1, 1] * 4))
+    listed, rooms = torch.eye(V)[[0, 0]], torch.tensor([0, 1])
+    p = machine_of(adapted).object_log_odds(listed, room=rooms)[:, 4].sigmoid()
+    assert p[0] > 0.25
+    assert p[1] < 0.5 * p[0]
+    names = [name for name in parent.arrays if not np.array_equal(adapted[name], parent[name])]
+    assert sorted(names) == ["W", "Y", "b"]
 
 
 def test_a_home_without_pairs_or_a_model_without_samples_is_refused():
