@@ -33,6 +33,11 @@ def printable(text: str) -> str:
     return "".join(one if one.isprintable() else repr(one)[1:-1] for one in text)
 
 
+def printable_lines(text: str) -> str:
+    """Return a text whose lines are `printable`. Each line break must be one of the caller."""
+    return "\n".join(map(printable, text.split("\n")))
+
+
 def printable_json(text: str) -> str:
     r"""Return a JSON text with `\uXXXX` in place of each unprintable character. Its value stays."""
     if text.isprintable():
