@@ -1,6 +1,7 @@
 """Texts of others on a terminal: escaped, on the line of the program that prints them."""
 
 import json
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,11 +11,16 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
+from app.registry import Store, load_model_set
+from app.registry.__main__ import main
+from app.serving.logs import Masked
 from scene_client import HomeFileError, MessageError, ProblemError
 from scene_client.command import app
 from scene_client.errors import DeadlineError, problem_of
+from scene_client.schemas import MAX_LABEL
 from scene_client.untrusted import printable, printable_json
 from tests.client.peers import Peer, answering
+from tests.registry.small_artifacts import description, rewrite_manifest, state
 
 HOSTILE = "\x1b]0;owned\x07\x1b[2Jlamp\nsofa\r\x00\x7f\x9b31m\u202egnp.exe\u2066\u200b\u2028\ud83d"
 """Sequences of terminals, line breaks, control characters of both sets, and marks of direction."""
@@ -185,3 +191,95 @@ def test_the_texts_of_a_hostile_file(name: str, tmp_path: Path) -> None:
     assert done.exit_code in (2, 3)
     assert is_plain(done.stderr)
     assert len(done.stderr.splitlines()) <= 3
+
+
+# -------------------------------------------------------------------------- a store of models
+
+
+def thing(**members: Any) -> dict[str, Any]:
+    return {"label": "bed", "aliases": [], "structure": False} | members
+
+
+PLACES: dict[str, Callable[[dict[str, Any], str], object]] = {
+    "label": lambda m, text: m["vocabulary"]["objects"].__setitem__(0, thing(label=text)),
+    "alias": lambda m, text: m["vocabulary"]["objects"].__setitem__(0, thing(aliases=[text])),
+    "room type": lambda m, text: m["vocabulary"]["room_types"].__setitem__(0, text),
+    "room alias": lambda m, text: m["vocabulary"].update(room_aliases={"bedroom": [text]}),
+    "profile": lambda m, text: m["vocabulary"].update(profiles=[text]),
+    "source": lambda m, text: m["data"][0].update(source=text),
+    "terms of a source": lambda m, text: m["data"][0].update(terms=text),
+    "metric": lambda m, text: m["metrics"][0].update(metric=text),
+    "terms": lambda m, text: m.update(terms=text),
+    "training": lambda m, text: m["training"].update(parent={"name": [text], "version": "1.0.0"}),
+    "key of training": lambda m, text: m["training"].update({text: 1}),
+    "library": lambda m, text: m["libraries"].update({"torch": text}),
+    "name of a library": lambda m, text: m["libraries"].update({text: "1"}),
+    "example": lambda m, text: m.update(examples=[{"name": text, "scene": {"objects": ["bed"]}}]),
+    "scene": lambda m, text: m.update(examples=[{"name": "a", "scene": {"objects": [text]}}]),
+    "unknown field": lambda m, text: m.update({text: 1}),
+    "tensor": lambda m, text: m["tensors"].update({text: m["tensors"]["b"]}),
+}
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    Store(tmp_path / "store").publish(description("hostile"), state())
+    return tmp_path / "store"
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("text", ["\x1b[2Jlamp", "lamp\nbed", "\x9b31mlamp", "\u202epmal"])
+def test_a_manifest_with_such_texts_is_refused_in_one_line(
+    place: str, text: str, store: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rewrite_manifest(store / "hostile" / "1.0.0", lambda members: PLACES[place](members, text))
+    assert main(["list", "--store", str(store)]) == 0
+    shown = capsys.readouterr().out
+    assert is_plain(shown, lines=1)
+    assert "hostile@1.0.0  refused: " in shown
+
+
+def test_the_names_of_a_manifest_are_bounded(store: Path) -> None:
+    for length in (MAX_LABEL, MAX_LABEL + 1):
+        text = "lamp " * 20 + "s" * (length - 100)
+        for place in ("label", "alias", "room type", "room alias"):
+            folder = store / "hostile" / "1.0.0"
+            before = (folder / "manifest.json").read_bytes()
+            rewrite_manifest(folder, lambda m, place=place, text=text: PLACES[place](m, text))
+            failures = load_model_set(Store(store)).failures.values()
+            assert [one.reason.endswith("100 characters") for one in failures] == (
+                [True] if length > MAX_LABEL else []
+            )
+            (folder / "manifest.json").write_bytes(before)
+
+
+def test_the_command_of_the_registry_escapes_the_name_of_a_store(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["list", "--store", str(tmp_path / SENT.replace("\0", ""))]) == 1
+    assert is_plain(capsys.readouterr().err, lines=1)
+
+
+# ---------------------------------------------------------------------------- log of the service
+
+
+@pytest.mark.parametrize("style", ["plain", "json"])
+def test_a_line_of_the_log_is_one_line(style: Any) -> None:
+    record = logging.LogRecord("app", logging.ERROR, "", 1, "model %s", (SENT,), None)
+    text = Masked(style).format(record)
+    assert is_plain(text, lines=0)
+    if style == "json":
+        assert json.loads(text)["message"] == f"model {SENT}"
+    else:
+        assert text.endswith(f" app: model {printable(SENT)}")
+
+
+def test_a_traceback_keeps_its_lines() -> None:
+    try:
+        raise ValueError(SENT)
+    except ValueError as error:
+        record = logging.LogRecord("app", logging.ERROR, "", 1, SENT, (), None)
+        record.exc_info = (type(error), error, error.__traceback__)
+    lines = Masked("plain").format(record).split("\n")
+    assert lines[1] == "Traceback (most recent call last):"
+    assert is_plain("\n".join(lines))
