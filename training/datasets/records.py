@@ -13,6 +13,7 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from app.scene import RELATIONS
 from scene_client.frames import Conventions
+from scene_client.schemas import MAX_LABEL
 
 Box2d = tuple[float, float, float, float]
 
@@ -70,7 +71,15 @@ def _ordered(box: Box2d) -> Box2d:
     return box
 
 
+def _plain(label: str) -> str:
+    if not label.isprintable():
+        raise ValueError("must be one line without control characters")
+    return label
+
+
 Text = Annotated[str, Field(pattern=r"\S")]  # a text that is not blank
+Label = Annotated[Text, Field(max_length=MAX_LABEL), AfterValidator(_plain)]
+"""A label or a room type, which may become a name in a manifest."""
 Id = Annotated[str, BeforeValidator(lambda x: str(x) if type(x) is int else x)]
 """An id: a text, or an integer, which is converted to text."""
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -82,7 +91,7 @@ class AnnotatedObject:
     """One annotated object. None means that a value is unknown."""
 
     id: Id  # distinct within the scene
-    label: Text
+    label: Label
     # Centre (x, y, z) in metres.
     position: Annotated[tuple[Number, Number, Number], BeforeValidator(_of_request)] | None = None
     # Extents before rotation by the yaw, (x, y, z) in metres.
