@@ -1,5 +1,6 @@
 """Texts of others on a terminal: escaped, on the line of the program that prints them."""
 
+import io
 import json
 import logging
 from collections.abc import Callable, Iterator
@@ -9,6 +10,8 @@ from threading import Thread
 from typing import Any
 
 import pytest
+from rich.status import Status
+from rich.table import Table
 from typer.testing import CliRunner, Result
 
 from app.registry import Store, load_model_set
@@ -21,6 +24,8 @@ from scene_client.schemas import MAX_LABEL
 from scene_client.untrusted import printable, printable_json
 from tests.client.peers import Peer, answering
 from tests.registry.small_artifacts import description, rewrite_manifest, state
+from training.cli import app as training
+from training.domain import terminal
 
 HOSTILE = "\x1b]0;owned\x07\x1b[2Jlamp\nsofa\r\x00\x7f\x9b31m\u202egnp.exe\u2066\u200b\u2028\ud83d"
 """Sequences of terminals, line breaks, control characters of both sets, and marks of direction."""
@@ -283,3 +288,59 @@ def test_a_traceback_keeps_its_lines() -> None:
     lines = Masked("plain").format(record).split("\n")
     assert lines[1] == "Traceback (most recent call last):"
     assert is_plain("\n".join(lines))
+
+
+# -------------------------------------------------------------------------- commands of training
+
+
+def shown(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
+    with pytest.raises(SystemExit) as ended:
+        training(list(arguments), prog_name="training")
+    captured = capsys.readouterr()
+    return int(ended.value.code or 0), captured.out + captured.err
+
+
+MARKED = "[red]sofa[/red] :bed: [/]"
+
+
+def test_the_commands_of_training_print_names_as_they_are(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scenes = [
+        {"scene_id": f"{n} {SENT}", "group": f"g{n}", "objects": ["bed", MARKED, f"lamp {n}"]}
+        for n in range(40)
+    ]
+    # The command lists the scenes with one object.
+    scenes += [{"scene_id": name, "objects": ["bed"]} for name in (MARKED, SENT)]
+    path = tmp_path / "scenes.jsonl"
+    path.write_text("".join(json.dumps(scene) + "\n" for scene in scenes))
+    _, text = shown(capsys, "init", "my-lab", str(path), "--output", str(tmp_path / "lab"))
+    assert is_plain(text)
+    assert f"    - {MARKED}\n" in text
+    assert f"    - {printable(SENT)[:40]}" in text
+    adapted = ("adapt", "default", str(path), "--name", "h", "--store", str(tmp_path / "none"))
+    _, text = shown(capsys, *adapted)
+    assert is_plain(text)
+
+
+def test_an_error_of_a_file_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "scenes.jsonl"
+    relation = [["bed", "left", f"{SENT}{MARKED}"]]
+    path.write_text(json.dumps({"objects": ["bed"], "relations": relation}) + "\n")
+    code, text = shown(capsys, "init", "my-lab", str(path), "--output", str(tmp_path / "lab"))
+    assert code == 1
+    assert is_plain(text, lines=1)
+    assert MARKED in text
+
+
+def test_tables_states_and_progress_are_escaped() -> None:
+    stream = io.StringIO()
+    console = type(terminal.console)(markup=False, emoji=False, file=stream)
+    table = Table("a", SENT, title=SENT)
+    table.add_row(MARKED, SENT)
+    console.print(table)
+    console.print(Status(SENT))
+    console.print(SENT, MARKED)
+    assert is_plain(stream.getvalue())
+    assert stream.getvalue().count(r"\x1b[2Jlamp") >= 3
+    assert stream.getvalue().count(MARKED) == 2

@@ -14,6 +14,7 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 from app.scene import RELATIONS
 from scene_client.frames import Conventions
 from scene_client.schemas import MAX_LABEL
+from scene_client.untrusted import printable
 
 Box2d = tuple[float, float, float, float]
 
@@ -28,6 +29,7 @@ class DatasetError(ValueError):
     """
 
     def __init__(self, path: Path, where: str, problem: str) -> None:
+        problem = printable(problem)
         if len(problem) > MAX_PROBLEM:  # the text can contain a value of several megabytes
             problem = problem[:MAX_PROBLEM] + "…"
         super().__init__(f"{path}, {where}: {problem}" if where else f"{path}: {problem}")
