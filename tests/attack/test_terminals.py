@@ -58,7 +58,7 @@ def test_json_keeps_its_value() -> None:
 @contextmanager
 def peer(body: Any, status: bytes = b"200 OK") -> Iterator[str]:
     with Peer(answering(json.dumps(body).encode(), status)) as server:
-        Thread(target=server.serve_forever, daemon=True).start()
+        Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
         yield server.url
         server.shutdown()
 

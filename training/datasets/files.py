@@ -8,7 +8,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import IO, Final, TypeVar
+from typing import BinaryIO, Final, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -33,8 +33,9 @@ def read_lines(path: Path, limit: int) -> Iterator[bytes]:
     """
     try:
         with regular_file(path) as plain, ExitStack() as stack:
-            is_packed = path.suffix == ".gz"
-            file: IO[bytes] = stack.enter_context(gzip.open(plain)) if is_packed else plain
+            file: BinaryIO | gzip.GzipFile = plain
+            if path.suffix == ".gz":
+                file = stack.enter_context(gzip.open(plain))
             number = size = 0
             while line := file.readline(limit + 1):
                 number, size = number + 1, size + len(line)

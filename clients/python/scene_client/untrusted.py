@@ -7,6 +7,7 @@ import json
 import os
 import re
 import stat
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, BinaryIO, Final, TypeVar
@@ -45,19 +46,22 @@ def printable_json(text: str) -> str:
     return "".join(one if one.isprintable() else json.dumps(one)[1:-1] for one in text)
 
 
-def printable_answer(answer: ModelT) -> ModelT:
-    """Return an answer of the service whose texts are `printable`."""
-    return type(answer).model_validate(_printable_parts(answer.model_dump(exclude_unset=True)))
+def shortened(text: str, most: int) -> str:
+    """Return a text with at most ``most`` characters. The end of a longer text becomes "…"."""
+    return text if len(text) <= most else f"{text[: most - 1]}…"
 
 
-def _printable_parts(value: Any) -> Any:
-    if isinstance(value, str):
-        return printable(value)
-    if isinstance(value, dict):
-        return {_printable_parts(name): _printable_parts(part) for name, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_printable_parts(part) for part in value]
-    return value
+def printable_answer(answer: ModelT, most: int = sys.maxsize) -> ModelT:
+    """Return an answer of the service whose texts are `printable`, and `shortened` to ``most``."""
+
+    def cleaned(value: Any) -> Any:
+        if isinstance(value, str):
+            return shortened(printable(value[: most + 1]), most)
+        if isinstance(value, dict):
+            return {cleaned(name): cleaned(part) for name, part in value.items()}
+        return [*map(cleaned, value)] if isinstance(value, list | tuple) else value
+
+    return type(answer).model_validate(cleaned(answer.model_dump(exclude_unset=True)))
 
 
 # -------------------------------------------------------------------------------------- files
