@@ -26,7 +26,15 @@ from training.domain.evaluate_command import evaluate_command
 from training.domain.gate import MARGIN, NEW, losses, measure_usefulness, served_model
 from training.domain.init_command import example, init
 from training.domain.look import outside_vocabulary
-from training.domain.terminal import Display, StorePath, console, fail, next_steps, print_lines
+from training.domain.terminal import (
+    Display,
+    StorePath,
+    console,
+    fail,
+    next_steps,
+    print_lines,
+    print_marked,
+)
 from training.evaluation.report import Progress
 from training.fit.configuration import Config, ConfigError
 from training.fit.trainer import Trainer
@@ -218,7 +226,7 @@ def _prepare(config: Config, data: Path) -> SplitScenes:
     if line := outside_vocabulary(scene for part in scenes.parts.values() for scene in part):
         print_lines(line)
     for reason in reasons:
-        console.print(f"[yellow]note:[/yellow] an example is left out: {reason}", soft_wrap=True)
+        print_marked("note:", "yellow", f"an example is left out: {reason}")
     return replace(scenes, examples=examples)
 
 
@@ -235,7 +243,7 @@ def _print_accepted(reason: str) -> None:
 
 
 def _exit_refused(error: RefusedError, remedy: str = "") -> NoReturn:
-    console.print(f"[red]refused:[/red] {error}", soft_wrap=True)
+    print_marked("refused:", "red", str(error))
     console.print(f"nothing was published{remedy}")
     raise typer.Exit(3) from None
 

@@ -12,6 +12,7 @@ import numpy as np
 import typer
 from rich import box
 from rich.table import Table
+from rich.text import Text
 from torch import Tensor
 
 from app.registry import DEFAULT_STORE, RegistryError, Store
@@ -129,13 +130,13 @@ def show(comparison: Comparison) -> None:
     for row in comparison.results.differences:
         if row.task != task:
             task = row.task
-            table.add_row(f"[bold]{in_words(task)}[/bold]")
+            table.add_row(Text(in_words(task), "bold"))
         colour = _COLOURS.get(row.verdict, "dim")
         table.add_row(
             f"  {row.metric}",
             *(f"{values[name, row.task, row.metric]:.3f}" for name in titles),
             difference_text(row.figure),
-            f"[{colour}]{row.verdict}[/{colour}]",
+            Text(row.verdict, colour),
         )
     console.print(table)
     notes = list(comparison.notes)
@@ -143,7 +144,7 @@ def show(comparison: Comparison) -> None:
         names = ", ".join(map(in_words, comparison.unmeasured))
         notes.append(f"{comparison.a} was not measured in {names}: the scenes contain no relations")
     for note in notes:
-        console.print(f"note: {note}", markup=False, soft_wrap=True)
+        console.print(f"note: {note}", soft_wrap=True)
 
 
 def difference_text(figure: Figure) -> str:

@@ -10,6 +10,7 @@ import torch
 import typer
 from rich import box
 from rich.table import Table
+from rich.text import Text
 
 from app.registry import DEFAULT_STORE, Artifact, Metric, RegistryError, Store
 from training.datasets import DatasetError
@@ -129,6 +130,6 @@ def _show(tables: Figures, title: str | None = None) -> None:
     for (task, metric, source), values in sorted(figures.items(), key=lambda item: item[0][0]):
         if task != heading:
             heading = task
-            table.add_row(f"[bold]{in_words(task)}[/bold]")
+            table.add_row(Text(in_words(task), "bold"))
         table.add_row(f"  {metric}", source, *(values.get(name, "") for name in tables))
     console.print(table)

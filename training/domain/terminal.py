@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Final, NoReturn
 
 import typer
-from rich.console import Console
-from rich.markup import escape
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.segment import Segment
+from rich.text import Text
 
 from app.registry import RegistryError
+from scene_client.untrusted import printable, printable_lines
 from training.datasets.records import InvalidLinesError
 from training.domain.look import Finding
 from training.fit.trainer import SCORES, CurvePoint, Trainer
@@ -23,13 +25,31 @@ StorePath = Annotated[
     str, typer.Option("--store", envvar="SCENE_STORE", help="folder of the model store")
 ]
 
-console = Console()
+
+class _Console(Console):
+    """A console for texts of others: it escapes control characters, and reads no markup."""
+
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterable[Segment]:
+        """Yield the parts of the output: also those of tables, progress bars and states."""
+        for segment in super().render(renderable, options):
+            is_safe = segment.control or segment.text.isprintable()
+            yield segment if is_safe else segment._replace(text=printable_lines(segment.text))
+
+
+console = _Console(markup=False, emoji=False)
 
 
 def print_lines(*lines: str) -> None:
-    """Print lines as they are: without markup, colours and line breaks."""
+    """Print texts, each on one line, without colours."""
     for line in lines:
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+        console.print(printable(line), highlight=False, soft_wrap=True)
+
+
+def print_marked(mark: str, colour: str, text: str) -> None:
+    """Print a coloured word, such as "error:", and a text."""
+    console.print(Text.assemble((mark, colour), " ", text), soft_wrap=True)
 
 
 def listing(title: str, entries: Sequence[str]) -> list[str]:
@@ -47,7 +67,7 @@ def fail(error: Exception) -> NoReturn:
         further = [f"  {error.path.name}, {line.where}: {line.problem}" for line in error.errors]
         more = error.count - len(error.errors)
         further += [f"  and {more} more"] if more else []
-    console.print(f"[red]error:[/red] {escape(reason)}", soft_wrap=True)
+    print_marked("error:", "red", reason)
     print_lines(*further)
     raise typer.Exit(1) from None
 
@@ -100,7 +120,7 @@ def next_steps(folder: Path) -> None:
 
 def print_finding(finding: Finding) -> None:
     """Print a property of the scenes that the user should check."""
-    console.print(f"  [yellow]{finding.count}[/yellow] × {finding.what}")
+    console.print(Text.assemble("  ", (str(finding.count), "yellow"), f" × {finding.what}"))
     console.print(f"    {finding.advice}")
     for example in finding.examples:
-        console.print(f"    - {example}", markup=False)
+        print_lines(f"    - {example}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import errno
 import math
 import os
 import time
@@ -12,16 +12,21 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from pydantic import TypeAdapter
+from pydantic_core import from_json
 
 from scene_client import schemas
 from scene_client.errors import HomeFileError
 from scene_client.home_settings import Latch
-from scene_client.tracks import Track, Vector
+from scene_client.tracks import Place, Track, Vector
+from scene_client.untrusted import printable, read_regular
 
 FORMAT: Final = "scene-home"
 VERSION: Final = 1  # of the file
 UNKNOWN: Final = "nearest-or-ignore"  # treatment of unknown labels
 MOST_THINGS, MOST_ROOMS = 256, schemas.MAX_ROOMS  # of a room in a request, and of a home
+MOST_BYTES: Final = 2**23  # of the file; 10,000 things have 5 MB
+_MOST: Final = 1e12  # absolute value of a number in the file; times have 2e9
+_LONGEST: Final = 256  # characters of a text in the file
 HEADINGS, LOOKS = 8, 30  # directions, or looks without poses, that show a whole room
 
 Kind = Literal[
@@ -115,7 +120,7 @@ class State:
 
     stamp: float | None = None  # time of the last frame
     room: str = ""  # room of the robot
-    shift: Vector = (0.0, 0.0, 0.0)  # of the map
+    shift: Place = (0.0, 0.0, 0.0)  # of the map
     count: int = 0  # number of all tracks, also of ended ones
     habits: set[tuple[str, str]] = field(default_factory=set)  # label and room
     rooms: dict[str, Room] = field(default_factory=dict)
@@ -147,16 +152,21 @@ class State:
         return fields
 
 
+_FILE: Final = TypeAdapter(State)
+
+
 def write_state(state: State, path: Path) -> None:
     """Replace the file of a home. A reader, or a crash, never sees a part of it.
 
     Raises:
-        OSError: the file cannot be written.
+        OSError: the file cannot be written, or would be larger than `read_state` accepts.
     """
-    sibling = path.with_name(f".{path.name}.{os.getpid()}")
+    sibling, content = path.with_name(f".{path.name}.{os.getpid()}"), _FILE.dump_json(state)
+    if len(content) > MOST_BYTES:
+        raise OSError(errno.EFBIG, f"the home has more than {MOST_BYTES} bytes")
     try:
         with sibling.open("wb") as file:
-            file.write(TypeAdapter(State).dump_json(state))
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         sibling.replace(path)
@@ -171,7 +181,7 @@ def read_state(path: Path) -> State:
         HomeFileError: the file is damaged, or of a newer version.
     """
     try:
-        return state_of(json.loads(path.read_bytes()), path)
+        return state_of(from_json(read_regular(path, MOST_BYTES)), path)
     except FileNotFoundError:
         return State()
     except (OSError, ValueError) as error:
@@ -189,13 +199,28 @@ def state_of(data: Any, path: str | os.PathLike[str]) -> State:
     try:
         version = data["version"]
         if version <= VERSION:
-            return TypeAdapter(State).validate_python(data)
+            _require_plain(data)
+            return _FILE.validate_python(data)
     except (LookupError, TypeError, ValueError) as error:
         raise _damaged(path, error) from None
     raise HomeFileError(
         f"{path} has version {version}, but this client reads up to version {VERSION}. Install a "
         "newer client, or name another file. It is left as it is."
     )
+
+
+def _require_plain(data: Any) -> None:
+    """Raise ValueError for a number or a text that no home has, and that would stop the robot."""
+    nodes = [data]
+    for node in nodes:
+        if isinstance(node, dict):
+            nodes += [*node, *node.values()]
+        elif isinstance(node, list):
+            nodes += node
+        elif isinstance(node, str) and not (node.isprintable() and len(node) <= _LONGEST):
+            raise ValueError(f"the text {printable(node[:40])} is not plain")
+        elif isinstance(node, int | float) and not abs(node) <= _MOST:
+            raise ValueError("a number is not finite, or out of range")
 
 
 def _damaged(path: str | os.PathLike[str], error: Exception) -> HomeFileError:

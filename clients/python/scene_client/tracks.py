@@ -10,14 +10,23 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Final
+from typing import Annotated, Any, Final
+
+from pydantic import Field
 
 from scene_client import schemas
 from scene_client.calls import validated
 from scene_client.home_settings import Latch, Settings
+from scene_client.schemas.requests import Angle, Coordinate, Extent, Label, Name
 
 Vector = tuple[float, float, float]
 Point = tuple[float, float]
+
+# Types of values that a file may state.
+Place = tuple[Coordinate, Coordinate, Coordinate]
+Sides = tuple[Extent, Extent, Extent]
+Votes = Annotated[dict[Label, Annotated[float, Field(gt=0)]], Field(min_length=1)]
+LogOdds = Annotated[float, Field(ge=-100, le=100)]
 
 CELL: Final = 1.0  # width of a cell of the grid of tracks, and the largest gate
 MOST_CERTAIN: Final = 8.0  # largest log-odds of existence; a gone thing needs about 10 looks
@@ -72,19 +81,19 @@ def _seen(one: schemas.Detection) -> Seen:
 class Track:
     """One thing, or a wrong detection as long as it is not confirmed."""
 
-    id: str
+    id: Name
     room: str
-    log_odds: float  # ln(p / (1 - p)) of the probability that the thing exists
+    log_odds: LogOdds  # ln(p / (1 - p)) of the probability that the thing exists
     first: float  # time of the first detection
     last: float  # time of the last detection
-    votes: dict[str, float] = field(default_factory=dict)  # sum of confidences by label
-    place: Vector | None = None  # running mean, like the size
-    size: Vector | None = None
-    yaw: float | None = None
+    votes: Votes = field(default_factory=dict)  # sum of confidences by label
+    place: Place | None = None  # running mean, like the size
+    size: Sides | None = None
+    yaw: Angle | None = None
     looked: float | None = None  # time of the last look, with or without a detection
     judged: float | None = None  # time of the last step of the alarm
     named: str | None = None  # label in the last event about it
-    looks: float = 0.0  # number of looks with a detection
+    looks: Annotated[float, Field(ge=0)] = 0.0  # number of looks with a detection
     missed: float = 0.0  # number of looks without one, since the last detection
     is_confirmed: bool = False
     verdict: str | None = None  # kind of alarm in the last answer
