@@ -63,6 +63,14 @@ def test_it_is_saved_every_ten_seconds_of_the_stamps(file):
     assert json.loads(file.read_text())["stamp"] == 34.0
 
 
+def test_a_confirmed_habit_is_saved_at_once(file):
+    """A robot that stands still sends no frames, so no later frame may be needed."""
+    one = home(file)
+    run(one, range(5))
+    one.confirm(next(t.id for t in one.things() if t.label == "stove"))
+    assert home(file).confirmed == {("stove", "kitchen")}
+
+
 PROGRAM = """
 import sys
 from tests.client.test_home_file import home, run

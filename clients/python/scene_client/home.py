@@ -335,8 +335,9 @@ class Home(AbstractContextManager["Home"]):
     def confirm(self, track_id: str) -> list[Event]:
         """State that a thing belongs where it is. Return the alarms that this clears.
 
-        Things of this label in this room raise no alarm from now on. With ``record``, the scene of
-        the room is recorded as confirmed, without the things of other alarms.
+        Things of this label in this room raise no alarm from now on, which is saved at once. With
+        ``record``, the scene of the room is recorded as confirmed, without the things of other
+        alarms.
 
         Raises:
             KeyError: the home has no such thing.
@@ -352,6 +353,8 @@ class Home(AbstractContextManager["Home"]):
             kind = self._rooms.get(track.room, Room()).settled_type(track.room)
             scene = self._scene(quiet, track.room) | {"confirmed": True, "room_type": kind}
             self._recorder.confirm(schemas.SceneRequest.model_validate(scene))
+        if self.path is not None:
+            self._try_save()  # a person's decision is not lost with the last seconds
         return events
 
     # --------------------------------------------------------------------------------- the file
