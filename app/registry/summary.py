@@ -93,7 +93,7 @@ def knows(subject: str, words: Vocabulary, calibration: Calibration) -> str:
     if not rooms:
         return f"{sentence}no type of room."
     sentence += f"{_number(len(rooms), 'type')} of rooms, such as {_some(rooms)}"
-    if written := len(calibration.written_rooms):
+    if 0 < (written := len(calibration.written_rooms)) < len(rooms):
         sentence += f"; {written:,} of these types come from written descriptions alone"
     return f"{sentence}."
 

@@ -245,6 +245,9 @@ def test_five_habits_are_learnt_from_a_hundred_scenes(store, tmp_path):
     assert len(reported[1]) <= 2  # below 5 % of 50 scenes
     assert alarms(after, INTRUDER) == ["toilet"]  # an object that no scene shows stays wrong
     assert str(store.aliases()["default"]) == "home@1.0.0"
+    card = stored(store, "home@1.0.0").card
+    assert "with 100 recorded scenes of this home." in card
+    assert "raises an alarm, right or wrong, in " in card
     assert f"to roll back: python -m app.registry alias default {'@'.join(key)}" in output
     # `default` is now the home, whose parent is adapted again.
     few = write(reported[0][:15], tmp_path / "few.jsonl")  # the weights stay
