@@ -214,6 +214,22 @@ def test_a_confirmed_habit_stays_quiet_and_is_recorded(client, tmp_path):
         one.confirm("t99")
 
 
+@pytest.mark.parametrize("pose", [(0.0, 0.0), (0.0, 0.0, "north"), {"x": 1.0, "y": 2.0}])
+def test_an_invalid_pose_is_named_and_changes_nothing(client, pose):
+    one = home(client)
+    run(one, range(5), KITCHEN)
+    before = one.things()
+    with pytest.raises(InvalidRequestError, match=r"#/pose: must be x, y and yaw"):
+        one.update([thing("cup", 2.0)], pose, 5.0)
+    assert one.things() == before
+    assert one.matched
+
+
+def test_a_room_needs_three_corners(client):
+    with pytest.raises(ValueError, match="room hall: a polygon needs at least three corners"):
+        Home(client, {"hall": [(0, 0), (1, 0)]})
+
+
 def test_the_settled_type_of_a_room_is_recorded(client, tmp_path):
     one = home(client, record=tmp_path / "scenes.jsonl")
     run(one, range(20), [thing("stove", 8.0), thing("fridge", 9.0, 1.0)], BESIDE)

@@ -68,6 +68,7 @@ class Home(AbstractContextManager["Home"]):
 
     Raises:
         HomeFileError: the file is damaged, or of a newer version.
+        ValueError: the polygon of a room has fewer than three corners.
     """
 
     def __init__(
@@ -87,6 +88,9 @@ class Home(AbstractContextManager["Home"]):
         self.matched: list[str] = []  # track of each detection of the last frame
         self.confirmed: set[tuple[str, str]] = set()  # habits: label and room
         self._polygons, self._candidates = dict(rooms or {}), list(room_candidates)
+        for name, polygon in self._polygons.items():
+            if len(polygon) < 3:
+                raise ValueError(f"room {name}: a polygon needs at least three corners")
         self._recorder = None if record is None else Recorder(record)
         self._rooms = {name: Room() for name in self._polygons}
         self._tracks = Tracks(self.settings, self._room_of)
@@ -113,16 +117,16 @@ class Home(AbstractContextManager["Home"]):
 
         Positions and the `pose` (x, y, yaw) are in the frame ``map``. `stamp` is in seconds; the
         default is the clock of the computer. `room` is the robot's room; the default is the polygon
-        with the robot. `view` replaces that of the home. Invalid detections raise an
-        `InvalidRequestError`.
+        with the robot. `view` replaces that of the home. Invalid detections or poses raise an
+        `InvalidRequestError`, and change nothing.
         """
-        seen = read_detections(detections)
+        seen, at = read_detections(detections), pose_of(pose)
         if (now := seconds_of(stamp)) < self._now:  # a recording starts again
             self._saved = self._next = now
             self._now = now - 1.0
         elapsed, self._now = now - self._now, now
         self._tracks.follow_jump(seen)
-        self._pose = None if (at := pose_of(pose)) is None else minus(at, self._tracks.shift)
+        self._pose = None if at is None else minus(at, self._tracks.shift)
         if room is None and self._pose is not None and self._polygons:
             room = self._room_of(self._pose, self.room) or self.room
         self.room = room or ""

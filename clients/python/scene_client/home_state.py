@@ -14,7 +14,7 @@ from typing import Any, Final, Literal
 from pydantic import TypeAdapter
 
 from scene_client import schemas
-from scene_client.errors import HomeFileError
+from scene_client.errors import HomeFileError, InvalidRequestError
 from scene_client.home_settings import Latch
 from scene_client.tracks import Point, Track, Vector
 
@@ -72,11 +72,20 @@ class Room:
 
 
 def pose_of(values: Sequence[float] | Mapping[str, float] | None) -> Vector | None:
-    """Return x, y and yaw; None if the robot is not located."""
+    """Return x, y and yaw; None if the robot is not located.
+
+    Raises:
+        InvalidRequestError: the values are not three numbers.
+    """
     if values is None:
         return None
-    x, y, yaw = [values[n] for n in ("x", "y", "yaw")] if isinstance(values, Mapping) else values
-    return (float(x), float(y), float(yaw)) if all(map(math.isfinite, (x, y, yaw))) else None
+    try:
+        if isinstance(values, Mapping):
+            values = [values[name] for name in ("x", "y", "yaw")]
+        x, y, yaw = map(float, values)
+    except (KeyError, TypeError, ValueError):
+        raise InvalidRequestError.about("must be x, y and yaw in radians", "#/pose") from None
+    return (x, y, yaw) if all(map(math.isfinite, (x, y, yaw))) else None
 
 
 def seconds_of(stamp: float | schemas.Stamp | schemas.Body | None) -> float:
