@@ -400,7 +400,15 @@ def where(
     fields |= general.conventions | _named(top_k=top_k, unknown_labels=unknown_labels)
     if places:
         fields["searched"] = [*fields.get("searched", ()), *places]
-    _show(context, lambda client: client.where(label, **fields), tables.where)
+    shown = partial(tables.where, labels=_labels_of(fields["rooms"]))
+    _show(context, lambda client: client.where(label, **fields), shown)
+
+
+def _labels_of(rooms: Any) -> dict[str, str]:
+    """Return the labels of the objects of rooms by id; the client validates the rooms later."""
+    things = [one for room in rooms if isinstance(room, dict) for one in room.get("objects") or ()]
+    named = [one for one in things if isinstance(one, dict) and "id" in one and "label" in one]
+    return {str(one["id"]): str(one["label"]) for one in named}
 
 
 # ------------------------------------------------------------------------------------- models

@@ -127,11 +127,14 @@ def rooms(answer: schemas.RoomsAnswer) -> RenderableType:
     return _table("room type", "listed as", "probability", "because", rows=rows)
 
 
-def where(answer: schemas.WhereAnswer) -> RenderableType:
-    """Return a table of the places of one thing, most probable first, and of its absence."""
+def where(answer: schemas.WhereAnswer, labels: Mapping[str, str]) -> RenderableType:
+    """Return a table of the places of one thing, most probable first, and of its absence.
+
+    `labels` are those of the objects by id.
+    """
     likely = [entry for entry in answer.places if entry.probability >= POSSIBLE_PLACE]
     others = 1.0 - answer.not_here - sum(entry.probability for entry in likely)
-    rows = [(_place(entry), f"{entry.probability:.3f}") for entry in likely]
+    rows = [(_place(entry, labels), f"{entry.probability:.3f}") for entry in likely]
     if others >= POSSIBLE_PLACE:
         rows.append(("at another place", f"{others:.3f}"))
     rows.append(("not here", f"{answer.not_here:.3f}"))
@@ -254,13 +257,16 @@ def _relations(relations: Sequence[schemas.Relation], words: Mapping[str, str]) 
     return "\n".join(lines)
 
 
-def _place(spot: schemas.Spot) -> str:
-    """Return a place in words, such as "bathroom: on top of sink_1"."""
+def _place(spot: schemas.Spot, labels: Mapping[str, str]) -> str:
+    """Return a place in words, such as "bathroom: on top of sink_1" or "… of sink (t12)"."""
+    thing = spot.object or ""
     if spot.is_listed:
-        return f"{spot.room}: seen there ({spot.object})"
+        return f"{spot.room}: seen there ({thing})"
     if spot.relation is None:
         return f"{spot.room}: elsewhere"
-    return f"{spot.room}: {PREPOSITIONS[spot.relation]} {spot.object}"
+    label = labels.get(thing, thing)
+    name = thing if thing.startswith(label) else f"{label} ({thing})"
+    return f"{spot.room}: {PREPOSITIONS[spot.relation]} {name}"
 
 
 def _placement(placement: schemas.Placement) -> str:
