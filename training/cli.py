@@ -20,10 +20,10 @@ from app.registry.references import AliasTarget
 from training.datasets import DatasetError
 from training.datasets.files import DATA
 from training.domain.adapt_command import adapt_command
-from training.domain.candidates import Candidate
-from training.domain.compare import compare, compare_command, show
+from training.domain.candidates import of_run
+from training.domain.compare import MARGIN, compare, compare_command, show
 from training.domain.evaluate_command import evaluate_command
-from training.domain.gate import MARGIN, NEW, losses, measure_usefulness, served_model
+from training.domain.gate import NEW, measure_usefulness, served_model
 from training.domain.init_command import example, init
 from training.domain.look import outside_vocabulary
 from training.domain.terminal import (
@@ -293,10 +293,10 @@ def _promote(
         reasons = useful.objections()
         if served.candidate is not None and (accept or not reasons):
             try:
-                new = Candidate(NEW, run.config, scenes.digests, model, root)
+                new = of_run(NEW, run, scenes, model, root)
                 comparison = compare(new, served.candidate, root, say=say)
-                show(comparison)
-                reasons += losses(comparison, margin)
+                show(comparison, margin)
+                reasons += comparison.objections(margin)
             except ConfigError as error:
                 if accept is None:
                     raise

@@ -382,7 +382,7 @@ def test_a_polygon_without_area_is_refused(client, corners):
         home(client, rooms=ROOMS | {"hall": corners})
 
 
-@pytest.mark.parametrize("pose", [(0.0, 0.0), {"x": 0.0, "y": 0.0}, "map", 3.0])
+@pytest.mark.parametrize("pose", [(0.0, 0.0), (0.0, 0.0, "north"), {"x": 0.0, "y": 0.0}, 3.0])
 def test_a_pose_of_another_form_is_refused_and_changes_nothing(client, pose):
     one = home(client)
     run(one, range(5), KITCHEN)
