@@ -18,6 +18,7 @@ from app.model import SceneModel
 from app.registry import DEFAULT_STORE, Artifact, RegistryError, Store
 from app.registry.references import AliasTarget
 from training.datasets import DatasetError
+from training.datasets.console import console, print_lines, print_marked
 from training.datasets.files import DATA
 from training.domain.adapt_command import adapt_command
 from training.domain.candidates import of_run
@@ -26,15 +27,7 @@ from training.domain.evaluate_command import evaluate_command
 from training.domain.gate import NEW, measure_usefulness, served_model
 from training.domain.init_command import example, init
 from training.domain.look import outside_vocabulary
-from training.domain.terminal import (
-    Display,
-    StorePath,
-    console,
-    fail,
-    next_steps,
-    print_lines,
-    print_marked,
-)
+from training.domain.terminal import Display, StorePath, fail, next_steps
 from training.evaluation.report import Progress
 from training.fit.configuration import Config, ConfigError
 from training.fit.trainer import Trainer

@@ -25,7 +25,7 @@ from scene_client.untrusted import printable, printable_json
 from tests.client.peers import Peer, answering
 from tests.registry.small_artifacts import description, rewrite_manifest, state
 from training.cli import app as training
-from training.domain import terminal
+from training.datasets.console import console as training_console
 
 HOSTILE = "\x1b]0;owned\x07\x1b[2Jlamp\nsofa\r\x00\x7f\x9b31m\u202egnp.exe\u2066\u200b\u2028\ud83d"
 """Sequences of terminals, line breaks, control characters of both sets, and marks of direction."""
@@ -335,7 +335,7 @@ def test_an_error_of_a_file_is_one_line(tmp_path: Path, capsys: pytest.CaptureFi
 
 def test_tables_states_and_progress_are_escaped() -> None:
     stream = io.StringIO()
-    console = type(terminal.console)(markup=False, emoji=False, file=stream)
+    console = type(training_console)(markup=False, emoji=False, file=stream)
     table = Table("a", SENT, title=SENT)
     table.add_row(MARKED, SENT)
     console.print(table)

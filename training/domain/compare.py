@@ -28,9 +28,10 @@ from app.registry.summary import (
 from training.datasets import AnnotatedScene, DatasetError, annotated_classes, encode
 from training.datasets.batches import SceneTensors, scene_tensors
 from training.datasets.cases import some_scenes
+from training.datasets.console import console, print_lines
 from training.datasets.files import DATA
 from training.domain.candidates import BASELINES, Candidate, find, held_out
-from training.domain.terminal import StorePath, console, fail, print_lines
+from training.domain.terminal import StorePath, fail
 from training.domain.translation import Translation, same_classes
 from training.evaluation.metrics import Figure
 from training.evaluation.outlier_tasks import LENGTHS

@@ -15,8 +15,9 @@ from rich.text import Text
 from app.registry import DEFAULT_STORE, Artifact, Metric, RegistryError, Store
 from training.datasets import DatasetError
 from training.datasets.batches import subset
+from training.datasets.console import console, print_lines
 from training.datasets.files import DATA
-from training.domain.terminal import StorePath, console, fail, print_lines
+from training.domain.terminal import StorePath, fail
 from training.evaluation.everyday_task import EVERYDAY
 from training.evaluation.metrics import Figure
 from training.evaluation.report import Progress, RoomList, evaluate, read_test

@@ -12,6 +12,7 @@ import typer
 
 from app.scene import label_key
 from training.datasets import DatasetError, generate_rooms
+from training.datasets.console import console, print_lines, print_marked
 from training.datasets.files import write_whole
 from training.datasets.jsonl import write_jsonl
 from training.datasets.rooms import DOMAINS
@@ -19,15 +20,7 @@ from training.datasets.vocabulary import left_out_line, vocabulary_json
 from training.domain.look import Label
 from training.domain.material import read_material
 from training.domain.proposal import Proposal, propose
-from training.domain.terminal import (
-    ROWS,
-    console,
-    fail,
-    listing,
-    print_finding,
-    print_lines,
-    print_marked,
-)
+from training.domain.terminal import ROWS, fail, listing, print_finding
 from training.domain.update import PROPOSED, proposed_json, update
 from training.fit.configuration import ConfigError
 from training.runs.config_files import shipped_configs

@@ -1,20 +1,18 @@
-"""What the commands of training share: console, errors, lists, progress, option of the store."""
+"""What the commands of training share: errors, lists, progress, option of the store."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Final, NoReturn
 
 import typer
-from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.segment import Segment
 from rich.text import Text
 
 from app.registry import RegistryError
-from scene_client.untrusted import printable, printable_lines
+from training.datasets.console import console, print_lines, print_marked
 from training.datasets.records import InvalidLinesError
 from training.domain.look import Finding
 from training.fit.trainer import SCORES, CurvePoint, Trainer
@@ -24,32 +22,6 @@ ROWS: Final = 12  # maximum number of entries of a printed list
 StorePath = Annotated[
     str, typer.Option("--store", envvar="SCENE_STORE", help="folder of the model store")
 ]
-
-
-class _Console(Console):
-    """A console for texts of others: it escapes control characters, and reads no markup."""
-
-    def render(
-        self, renderable: RenderableType, options: ConsoleOptions | None = None
-    ) -> Iterable[Segment]:
-        """Yield the parts of the output: also those of tables, progress bars and states."""
-        for segment in super().render(renderable, options):
-            is_safe = segment.control or segment.text.isprintable()
-            yield segment if is_safe else segment._replace(text=printable_lines(segment.text))
-
-
-console = _Console(markup=False, emoji=False)
-
-
-def print_lines(*lines: str) -> None:
-    """Print texts, each on one line, without colours."""
-    for line in lines:
-        console.print(printable(line), highlight=False, soft_wrap=True)
-
-
-def print_marked(mark: str, colour: str, text: str) -> None:
-    """Print a coloured word, such as "error:", and a text."""
-    console.print(Text.assemble((mark, colour), " ", text), soft_wrap=True)
 
 
 def listing(title: str, entries: Sequence[str]) -> list[str]:

@@ -17,8 +17,8 @@ import typer
 from pydantic import BaseModel, Field, ValidationError
 
 from training.datasets.batches import seen_triples
+from training.datasets.console import console
 from training.datasets.files import write_whole
-from training.domain.terminal import console
 from training.evaluation.calibration_task import NAMES
 from training.evaluation.everyday_task import EVERYDAY, facts_file
 from training.evaluation.metrics import Scored

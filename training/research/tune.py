@@ -30,8 +30,8 @@ import typer
 from pydantic import BaseModel, ValidationError
 
 from training.datasets.batches import TrainingData
+from training.datasets.console import console
 from training.datasets.files import write_whole
-from training.domain.terminal import console
 from training.evaluation.asking import score_missing, score_relations
 from training.evaluation.metrics import Metric, paired_difference
 from training.evaluation.report import SourceReport, measure, pooled

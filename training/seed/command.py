@@ -25,8 +25,8 @@ import torch
 import typer
 
 from training.datasets import DatasetError
+from training.datasets.console import console, print_marked
 from training.datasets.files import DATA, write_whole
-from training.domain.terminal import console, print_marked
 from training.seed.machines import EPOCHS, KINDS, LEARNING_RATE, VARIANTS, train
 from training.seed.protocol import (
     ANNEALED,
