@@ -18,15 +18,16 @@ from app.model import SceneModel
 from app.registry import DEFAULT_STORE, Artifact, RegistryError, Store
 from app.registry.references import AliasTarget
 from training.datasets import DatasetError
+from training.datasets.console import console, print_lines, print_marked
 from training.datasets.files import DATA
 from training.domain.adapt_command import adapt_command
-from training.domain.candidates import Candidate
-from training.domain.compare import compare, compare_command, show
+from training.domain.candidates import of_run
+from training.domain.compare import MARGIN, compare, compare_command, show
 from training.domain.evaluate_command import evaluate_command
-from training.domain.gate import MARGIN, NEW, losses, measure_usefulness, served_model
+from training.domain.gate import NEW, measure_usefulness, served_model
 from training.domain.init_command import example, init
 from training.domain.look import outside_vocabulary
-from training.domain.terminal import Display, StorePath, console, fail, next_steps, print_lines
+from training.domain.terminal import Display, StorePath, fail, next_steps
 from training.evaluation.report import Progress
 from training.fit.configuration import Config, ConfigError
 from training.fit.trainer import Trainer
@@ -218,7 +219,7 @@ def _prepare(config: Config, data: Path) -> SplitScenes:
     if line := outside_vocabulary(scene for part in scenes.parts.values() for scene in part):
         print_lines(line)
     for reason in reasons:
-        console.print(f"[yellow]note:[/yellow] an example is left out: {reason}", soft_wrap=True)
+        print_marked("note:", "yellow", f"an example is left out: {reason}")
     return replace(scenes, examples=examples)
 
 
@@ -235,7 +236,7 @@ def _print_accepted(reason: str) -> None:
 
 
 def _exit_refused(error: RefusedError, remedy: str = "") -> NoReturn:
-    console.print(f"[red]refused:[/red] {error}", soft_wrap=True)
+    print_marked("refused:", "red", str(error))
     console.print(f"nothing was published{remedy}")
     raise typer.Exit(3) from None
 
@@ -285,10 +286,10 @@ def _promote(
         reasons = useful.objections()
         if served.candidate is not None and (accept or not reasons):
             try:
-                new = Candidate(NEW, run.config, scenes.digests, model, root)
+                new = of_run(NEW, run, scenes, model, root)
                 comparison = compare(new, served.candidate, root, say=say)
-                show(comparison)
-                reasons += losses(comparison, margin)
+                show(comparison, margin)
+                reasons += comparison.objections(margin)
             except ConfigError as error:
                 if accept is None:
                     raise

@@ -30,8 +30,8 @@ router = APIRouter(
 async def confirm(data: ConfirmRequest, http: Request) -> bytes:
     """Append a scene in which everything is right to the recording of the service.
 
-    `training adapt` learns from the recording. One confirmed scene covers a habit: its objects
-    raise no alarm in rooms of its type any more.
+    `training adapt` learns from the recording. One confirmed scene covers a habit: new weights
+    make its objects likelier in rooms of its type, and exceptions raise no alarm in any room.
     """
     runtime: Runtime = http.app.state.runtime
     state, recorder = http.scope["state"], runtime.recorder

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Final, NamedTuple, Self
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
@@ -140,6 +140,9 @@ class FitLimit(Frozen):
 
 
 NO_LIMIT: Final = FitLimit(intercept=-1e9)
+
+RARELY: Final = 1 / 500
+"""A class is rarely shown if a smaller share of the training scenes shows it."""
 
 LONGEST_JUDGED: Final = 36
 """Maximum number of listed classes to which alarm lines are fitted. Longer lists count as such."""
@@ -277,6 +280,13 @@ class Calibration(Frozen):
             return None
         line: AlarmLine = getattr(lines, sensitivity)
         return max(line.threshold(min(n, LONGEST_JUDGED)), LEAST_ALARM[sensitivity])
+
+    def rarely_shown(self, classes: int) -> Bool[NDArray[np.bool_], "V"]:
+        """Return True for classes that fewer than `RARELY` of the training scenes show."""
+        if not self.popularity:
+            return np.zeros(classes, np.bool_)
+        popularity = np.array(self.popularity, dtype=np.float64)
+        return ~(popularity >= math.log(RARELY / (1 - RARELY)))  # NaN: no training scene
 
     @classmethod
     def neutral(cls, relations: int) -> Self:

@@ -20,7 +20,16 @@ from pydantic import (
 )
 
 Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
-Text = Annotated[str, StringConstraints(min_length=1)]
+
+
+def require_printable(value: str) -> str:
+    """Return a text on one line without control characters. Raise ValueError for another text."""
+    if not value.isprintable():
+        raise ValueError("must be one line without control characters")
+    return value
+
+
+Text = Annotated[str, StringConstraints(min_length=1), AfterValidator(require_printable)]
 Count = Annotated[int, Field(ge=0)]
 
 ItemT = TypeVar("ItemT")

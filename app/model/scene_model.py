@@ -27,9 +27,6 @@ _MOST_KEPT: Final = 4  # models with words that a model keeps, of about 20 MB ea
 
 _MOST_LISTED: Final = 256  # classes of a scene, and candidates of one computation
 
-RARELY: Final = 1 / 500
-"""A class is rarely shown if a smaller share of the training scenes shows it."""
-
 ROOM_SHARPNESS: Final = 1.5
 """Factor of the evidence of single classes for room types, which training keeps too small."""
 
@@ -162,11 +159,8 @@ class SceneModel:
 
     @cached_property
     def rarely_shown(self) -> Bool[NDArray[np.bool_], "V"]:
-        """True for classes that fewer than `RARELY` of the training scenes show."""
-        if not self.calibration.popularity:
-            return np.zeros(self.spec.V, np.bool_)
-        popularity = np.array(self.calibration.popularity, dtype=np.float64)
-        return ~(popularity >= math.log(RARELY / (1 - RARELY)))  # NaN: no training scene
+        """True for classes that few of the training scenes show (`Calibration.rarely_shown`)."""
+        return self.calibration.rarely_shown(self.spec.V)
 
     @cached_property
     def seats(self) -> Float[NDArray[np.float64], "V"]:

@@ -9,9 +9,11 @@ import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TextIO
 
 from app.registry import DEFAULT_STORE, RegistryError, Store, StoreError, load_model_set
 from app.registry.references import AliasTarget, version_key
+from scene_client.untrusted import printable
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -37,7 +39,7 @@ def main(arguments: list[str] | None = None) -> int:
             _list(store)
         return 0
     except RegistryError as error:
-        sys.stderr.write(f"store {root}: {error.reason}\n")
+        _print(f"store {root}: {error.reason}", sys.stderr)
         return 1
 
 
@@ -70,7 +72,7 @@ def _copy(
         try:
             is_new = target.copy(source, *key)
         except RegistryError as error:
-            sys.stderr.write(f"{'@'.join(key)} is not copied: {error.reason}\n")
+            _print(f"{'@'.join(key)} is not copied: {error.reason}", sys.stderr)
             status = 1
             continue
         if is_new:
@@ -88,7 +90,7 @@ def _copy(
             _print(f"alias '{alias}' still points at {old}, not at {new}")
         if replacement:
             terms = target.load(*target.resolve(str(new))).manifest.terms
-            _print(f"{new} replaces {old}. Its terms of use: {' '.join(terms.split())}")
+            _print(f"{new} replaces {old}. Its terms of use: {terms}")
     return status
 
 
@@ -171,8 +173,8 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _print(line: str) -> None:
-    sys.stdout.write(f"{line}\n")
+def _print(line: str, stream: TextIO | None = None) -> None:
+    (stream or sys.stdout).write(f"{printable(line)}\n")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The model card: purpose, metrics, data, terms and limits of a model.
+"""The model card: five sentences, purpose, metrics, data, terms and limits of a model.
 
 Sections follow Mitchell et al., "Model Cards for Model Reporting", FAT* 2019.
 """
@@ -10,11 +10,7 @@ from app.inference import MachineSpec
 from app.model.statistics import Counts, Offsets
 from app.registry.description import DataSource, Description
 from app.registry.manifest import TensorEntry, of_machine
-
-_RESEARCH_WARNING = """\
-> **Research use.** These weights were trained on {sources}, whose terms allow research use. Ask
-> the owners of the data before you ship the weights in a commercial robot. Models that were
-> trained only on freely licensed scenes do not carry this warning."""
+from app.registry.summary import summary
 
 _INTENDED_USE = """\
 A robot recognises the objects of a scene and asks the model about them. The scene should resemble
@@ -34,8 +30,8 @@ from a second training run with the same configuration on nine tenths of all sce
 of the second run used the other tenth."""
 
 _ADAPTED = """\
-The model was adapted to one home from {name}@{version}. The figures below compare it with this
-parent, in five folds of the recorded scenes: scenes that the adapted weights had not seen."""
+The figures below compare the model with its parent, in five folds of the recorded scenes: scenes
+that the adapted weights had not seen."""
 
 _PROBABILITIES = """\
 The probabilities are calibrated on validation scenes, and those of objects on random parts of the
@@ -75,8 +71,7 @@ _LIMITS = """\
 
 def render_card(description: Description, tensors: Mapping[str, TensorEntry]) -> str:
     """Return the model card in Markdown."""
-    words, parent = description.vocabulary, description.training.get("parent")
-    bound = [_cell(source.source) for source in description.data if source.research_only]
+    words = description.vocabulary
     proposed = sum(not entry.structure for entry in words.objects)
     machine = of_machine(tensors)
     weights = sum(prod(e.shape) for e in machine.values() if e.dtype.startswith("float"))
@@ -87,7 +82,7 @@ def render_card(description: Description, tensors: Mapping[str, TensorEntry]) ->
     )
     sections = [
         f"# {description.name} {description.version}",
-        *([_RESEARCH_WARNING.format(sources=", ".join(bound))] if bound else []),
+        "\n".join(f"- {_cell(sentence)}" for sentence in summary(description)),
         "## Model",
         _table(
             ("", ""),
@@ -108,7 +103,7 @@ def render_card(description: Description, tensors: Mapping[str, TensorEntry]) ->
         _INTENDED_USE,
         "## Metrics",
         *([_FINAL_FIT] if "measured_split" in description.training else []),
-        *([_ADAPTED.format_map(parent)] if isinstance(parent, dict) else []),
+        *([_ADAPTED] if "parent" in description.training else []),
         _metrics(description),
         "## Data and terms",
         *_shares(description.data),
@@ -171,16 +166,9 @@ def _metrics(description: Description) -> str:
         cells = rows.setdefault((entry.task, entry.metric), dict.fromkeys(sources, ""))
         cells[entry.source] = f"{entry.value:.3f} [{entry.low:.3f}, {entry.high:.3f}]"
     table = [(*name, *row.values()) for name, row in rows.items()]
-    calibration = description.calibration
-    judged = {"objects": calibration.outlier, "relations": calibration.misplaced.judges_relations}
-    unjudged = [
-        f"`/outliers` judges no {part}, because the calibration had too few scenes."
-        for part, is_judged in judged.items()
-        if not is_judged
-    ]
     note = [_OFFSETS] if any(entry.task == "Offsets" for entry in description.metrics) else []
     parts = [_MEASURED, _table(("Task", "Metric", *sources), table), _PROBABILITIES]
-    return "\n\n".join([*parts, *unjudged, *note])
+    return "\n\n".join([*parts, *note])
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

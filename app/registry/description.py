@@ -15,11 +15,20 @@ from pydantic import (
 )
 
 from app.model.calibration import PAIR_CALIBRATIONS, Calibration
-from app.model.fields import Count, Frozen, Many, Sha256, Text, Timestamp, to_json
+from app.model.fields import (
+    Count,
+    Frozen,
+    Many,
+    Sha256,
+    Text,
+    Timestamp,
+    require_printable,
+    to_json,
+)
 from app.registry.references import ModelName, Version
 from app.scene.spatial_relations import CANONICAL
 from app.scene.vocabulary import ObjectClass, Vocabulary
-from scene_client.schemas import Label, SceneRequest
+from scene_client.schemas import MAX_LABEL, Label, SceneRequest
 
 
 class VocabularyEntry(Frozen):
@@ -40,6 +49,10 @@ class VocabularyEntry(Frozen):
         if self.relations != CANONICAL[: len(self.relations)]:
             raise ValueError(f"relations must be the first of {CANONICAL}, in the same order")
         self._words = Vocabulary(self.objects, self.room_types, self.room_aliases)
+        names = [name for entry in self.objects for name in (entry.label, *entry.aliases)]
+        names += [*self.room_types, *(one for more in self.room_aliases.values() for one in more)]
+        if any(len(name) > MAX_LABEL for name in names):
+            raise ValueError(f"a name has more than {MAX_LABEL} characters")
         return self
 
     @classmethod
@@ -147,8 +160,14 @@ class Description(Frozen):
     @field_validator("spec", "training", "libraries", "terms")
     @classmethod
     def _check_json(cls, value: JsonValue) -> JsonValue:
-        # pydantic accepts NaN and lone surrogates in JSON without a schema. Neither can be written.
-        to_json(value).encode()
+        # pydantic accepts NaN in JSON without a schema. It cannot be written.
+        to_json(value)
+        nodes: list[Any] = [value]
+        for node in nodes:
+            if isinstance(node, str):
+                require_printable(node)
+            elif isinstance(node, dict | list):
+                nodes += [*node, *node.values()] if isinstance(node, dict) else node
         return value
 
     @model_validator(mode="after")

@@ -3,6 +3,8 @@
 import errno
 from typing import Final, Literal
 
+from scene_client.untrusted import printable
+
 Code = Literal[
     # of an artifact
     "missing_file", "unexpected_file", "unreadable", "too_large", "truncated", "checksum_mismatch",
@@ -22,9 +24,10 @@ OUTDATED: Final[frozenset[Code]] = frozenset({"outdated_format", "replaced_model
 
 
 class RegistryError(Exception):
-    """Base class of the registry's errors. The code and the reason never contain absolute paths."""
+    """Base class of the registry's errors. The reason is one line, without absolute paths."""
 
     def __init__(self, code: Code, reason: str) -> None:
+        reason = printable(reason)  # it may name a tensor or a field of a hostile file
         super().__init__(code, reason)
         self.code: Code = code
         self.reason = reason  # may name a file or a tensor, but not the folder

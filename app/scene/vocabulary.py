@@ -413,6 +413,8 @@ def _tables(
         for name in spellings:
             if not (key := label_key(name)):
                 raise ValueError(f"{kind} has an empty name: {name!r}")
+            if not name.isprintable():
+                raise ValueError(f"{kind} has a name with a control character: {name!r}")
             if (first := by_key.setdefault(key, index)) != index:
                 labels = {"first": names[first][0], "second": spellings[0]}
                 raise ValueError(clash.format(name=name, **labels))

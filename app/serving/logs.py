@@ -15,9 +15,20 @@ from typing import Any, Final, Literal
 import orjson
 
 from app.settings import Settings
+from scene_client.untrusted import printable, printable_json, printable_lines
 
 _MASK: Final = "**********"
-_PLAIN: Final = logging.Formatter("%(asctime)s %(levelname)-8s %(process)d %(name)s: %(message)s")
+
+
+class _Plain(logging.Formatter):
+    """Write each message on one line. Only a traceback has further lines."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802
+        """Return the first line of a record."""
+        return printable(super().formatMessage(record))
+
+
+_PLAIN: Final = _Plain("%(asctime)s %(levelname)-8s %(process)d %(name)s: %(message)s")
 
 MOST_LINES: Final = 10_000
 """Maximum number of lines that wait for the reader of the log, a few megabytes."""
@@ -62,6 +73,8 @@ class Masked(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """Return the log record as text, with the keys masked."""
         text = self._write(record)
+        if not text.isprintable():  # orjson escapes the control characters of ASCII alone
+            text = printable_json(text) if self._write is _json else printable_lines(text)
         for secret in self._secrets:
             text = text.replace(secret, _MASK)
         return text

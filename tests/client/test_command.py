@@ -132,7 +132,8 @@ def test_where_lists_places_in_words(scene: Any, url: str, tmp_path: Path) -> No
 SPOTS = [
     {"room": "bathroom", "probability": 0.5, "relation": "on-top", "object": "sink_1"},
     {"room": "kitchen", "probability": 0.2, "object": "soap_1", "is_listed": True},
-    {"room": "bathroom", "probability": 0.1},
+    {"room": "bathroom", "probability": 0.07},
+    {"room": "bathroom", "probability": 0.03, "relation": "inside", "object": "t7"},
     {"room": "hall", "probability": 0.004},
 ]
 
@@ -142,17 +143,29 @@ def test_the_table_of_places(scene: Any, peer: Any) -> None:
     body = ANSWERED | {"label": "soap", "listed_as": "Soaps", "rooms": [share]}
     body |= {"places": SPOTS, "not_here": 0.15}
     started = peer(answering(json.dumps(body).encode()))
-    done = scene("where", "Soaps", "-", "--url", started.url, stdin='{"bathroom": []}')
+    home = {"bathroom": [{"id": "sink_1", "label": "sink"}, {"id": "t7", "label": "bathtub"}]}
+    done = scene("where", "Soaps", "-", "--url", started.url, stdin=json.dumps(home))
     lines = [line.strip() for line in done.stdout.splitlines()]
     assert lines[0] == "Soaps (soap)"
     # The last place is unlikely, and the answer leaves further places out.
     assert [" ".join(line.split()) for line in lines[4:] if line] == [
         "bathroom: on top of sink_1 0.500",
         "kitchen: seen there (soap_1) 0.200",
-        "bathroom: elsewhere 0.100",
+        "bathroom: elsewhere 0.070",
+        "bathroom: inside bathtub (t7) 0.030",
         "at another place 0.050",
         "not here 0.150",
     ]
+
+
+def test_ids_without_a_meaning_have_their_label(scene: Any, peer: Any) -> None:
+    """The ids of a `Home` are numbers of tracks."""
+    spot = {"room": "bathroom", "probability": 0.5, "relation": "on-top", "object": "t12"}
+    body = ANSWERED | {"label": "soap", "places": [spot], "rooms": [], "not_here": 0.5}
+    started = peer(answering(json.dumps(body).encode()))
+    rooms = {"hall": [{"id": "t12", "label": "bed"}], "bathroom": [{"id": "t12", "label": "sink"}]}
+    done = scene("where", "soap", "-", "--url", started.url, stdin=json.dumps(rooms))
+    assert "bathroom: on top of sink (t12)" in done.stdout
 
 
 def test_outliers_show_doubt_and_several_rooms(scene: Any, peer: Any) -> None:

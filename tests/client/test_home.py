@@ -14,6 +14,7 @@ from scene_client import (
     InvalidRequestError,
     ProblemError,
     Settings,
+    UnknownThingError,
     UnreachableError,
     rooms_from_file,
 )
@@ -64,6 +65,29 @@ def test_an_alarm_is_one_event_and_so_is_its_end(client):
     events = run(one, range(40, 60), [*KITCHEN, thing("cup", 4.0)])
     assert kinds(events) == ["cleared"]
     assert one.alarms == []
+
+
+def test_another_label_is_one_event(client):
+    """The first detection has a swapped label. Later, two labels have equal votes."""
+    one = home(client)
+    seen = [[thing(label, 2.0), thing("fridge", 3.0)] for label in ("plant", "mirror")]
+    order = [0] * 3 + [1] * 17 + [0] * 15 + [0, 1] * 10
+    frames = [seen[which] for which in order]
+    events = [e for now, frame in enumerate(frames) for e in one.update(frame, POSE, float(now))]
+    plant, *_, change = [e for e in events if e.label in ("plant", "mirror")]
+    assert kinds(events, "appeared", "relabelled") == ["appeared", "appeared", "relabelled"]
+    assert (change.label, change.detail, change.id) == ("mirror", "plant", plant.id)
+
+
+def test_a_rare_swap_raises_no_doubt(client):
+    """The service compares the confidence with the context, so nine right looks count."""
+    one = home(client)
+    for now in range(10):
+        label = "vase" if now == 4 else "toilet"
+        one.update([thing("fridge", 2.0), thing(label, 3.0, 1.0)], POSE, float(now))
+    (toilet,) = [o for o in one.scene()["objects"] if o["label"] == "toilet"]
+    assert toilet["confidence"] > 0.99
+    assert "alternatives" not in toilet
 
 
 def test_a_changing_answer_raises_no_alarm(client):
@@ -210,7 +234,7 @@ def test_a_confirmed_habit_stays_quiet_and_is_recorded(client, tmp_path):
     assert scene.room_type == "kitchen"
     labels = sorted(thing.label for thing in scene.objects)
     assert labels == ["fridge", "stove", "toilet", "toilet"]  # not the towel, an open alarm
-    with pytest.raises(KeyError):
+    with pytest.raises(UnknownThingError, match="the home has no thing 't99', or it is gone"):
         one.confirm("t99")
 
 
@@ -248,6 +272,17 @@ def test_questions_about_the_home(client):
         one.update([], (0.0, 0.0, turn * math.pi / 4), 40.0 + turn)
     assert one.coverage("kitchen") == pytest.approx(0.9)
     assert one.coverage("area 2") < 0.3
+
+
+def test_an_id_leads_to_a_position_in_the_map(client):
+    one = home(client)
+    toilet = next(e.id for e in run(one, range(5), KITCHEN) if e.label == "toilet")
+    assert one.thing(toilet)["position"] == pytest.approx([3.0, -1.0, 0.5])
+    jumped = [thing(t["label"], t["position"][0] + 1.0, t["position"][1]) for t in KITCHEN]
+    run(one, range(5, 8), jumped, (1.0, 0.0, 0.0))
+    assert one.thing(toilet)["position"] == pytest.approx([4.0, -1.0, 0.5])
+    with pytest.raises(UnknownThingError):
+        one.thing("t99")
 
 
 def test_the_file_of_a_home_has_the_rooms_of_its_question(client, tmp_path):
@@ -329,6 +364,32 @@ def test_a_long_room_name_is_no_room_type(client):
     one = home(client, rooms=None)
     run(one, range(5), KITCHEN, None, room="x" * 200)
     assert all("room_type" not in fields for fields in client.questions("outliers"))
+
+
+@pytest.mark.parametrize(
+    "corners",
+    [
+        [(0.0, 0.0), (1.0, 0.0)],
+        [(0.0, 0.0), (1.0, 0.0), (0.0, 0.0)],
+        [(0.0, 0.0), (1.0, 0.0), (1.0, math.nan)],
+        [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0, 0.0)],
+        [0.0, 1.0, 2.0],
+        7,
+    ],
+)
+def test_a_polygon_without_area_is_refused(client, corners):
+    with pytest.raises(InvalidRequestError, match="#/rooms/hall: must be a list of at least three"):
+        home(client, rooms=ROOMS | {"hall": corners})
+
+
+@pytest.mark.parametrize("pose", [(0.0, 0.0), (0.0, 0.0, "north"), {"x": 0.0, "y": 0.0}, 3.0])
+def test_a_pose_of_another_form_is_refused_and_changes_nothing(client, pose):
+    one = home(client)
+    run(one, range(5), KITCHEN)
+    before = one.matched
+    with pytest.raises(InvalidRequestError, match="#/pose: must be x, y and yaw"):
+        one.update([*KITCHEN, thing("cup", 4.0)], pose, 5.0)
+    assert one.matched == before
 
 
 @pytest.mark.parametrize(

@@ -63,6 +63,15 @@ def test_it_is_saved_every_ten_seconds_of_the_stamps(file):
     assert json.loads(file.read_text())["stamp"] == 34.0
 
 
+def test_a_habit_is_saved_at_once(file):
+    """No further frame comes, and the program has no chance to close the home."""
+    one = home(file)
+    run(one, range(5))
+    one.confirm(one.things()[0].id)
+    assert json.loads(file.read_text())["habits"] == [[one.things()[0].label, "kitchen"]]
+    one.close()
+
+
 PROGRAM = """
 import sys
 from tests.client.test_home_file import home, run

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from scene_client import Home, InvalidRequestError, Settings
+from scene_client.floor_plan import inside
 from scene_client.home_settings import Latch
-from scene_client.home_state import inside
 from scene_client.tracks import FULL, LABELS, MOST_CERTAIN, POSES
 from tests.client.homes import FakeClient, thing
 

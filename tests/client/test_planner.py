@@ -158,6 +158,33 @@ def test_a_room_of_an_unknown_kind_is_named(scene: Client) -> None:
     assert second == 'I read "study" as office'
 
 
+def test_searched_places_are_marked_and_the_best_other_one_is_named(peer: Any) -> None:
+    spots = [
+        {"room": "store", "relation": "on-top", "object": "t1", "probability": 0.4},
+        {"room": "ward", "relation": "under", "object": "bed", "probability": 0.12},
+        {"room": "ward", "relation": "on-top", "object": "t2", "probability": 0.11},
+    ]
+    rooms = [{"room": "store", "probability": 0.4}, {"room": "ward", "probability": 0.25}]
+    answer = {"label": "mug", "places": spots, "rooms": rooms, "not_here": 0.35}
+    body = json.dumps(ENTRIES | answer).encode()
+    things = {"store": [{"id": "t1", "label": "shelf"}]}
+    things["ward"] = [{"id": "bed", "label": "bed"}, {"id": "t2", "label": "desk"}]
+    call = {"thing": "mug", "rooms": things}
+    with Client(peer(answering(body)).url) as client:
+        found = planner.call(client, "locate_object", call)
+        assert "Best" not in found
+        assert "store (0.40; on top of shelf (t1) 0.40)" in found
+        call["searched"] = ["store", "ward: bed", "ward: desk: 0.2"]
+        found = planner.call(client, "locate_object", call)
+    assert found.split(". ") == [
+        "I am not sure about mug",
+        "Possible: store (0.40; already searched, on top of shelf (t1) 0.40), ward (0.25; "
+        "under bed 0.12 (already searched), on top of desk (t2) 0.11)",
+        "Best unsearched place: on top of desk (t2) in ward (0.11)",
+        "In none of these rooms: 0.35.",
+    ]
+
+
 ENTRIES: dict[str, Any] = {
     "model": {"name": "home", "version": "1.0.0", "variant": "rbm", "digest": "0"},
     "request_id": "r",

@@ -324,7 +324,9 @@ def test_a_line_of_a_crash_is_repaired(file: Path) -> None:
         assert len(lines(file)) == kept + 1
     file.write_text("notes of a person")
     write(file, [request("desk", "lamp")])
-    assert file.read_text().startswith("notes of a person\n{")
+    assert file.read_text().startswith("{")
+    damaged = file.with_name("scenes.jsonl.damaged").read_text().splitlines()
+    assert damaged == [scene[:-9], scene[:40], "{", "notes of a person"]
 
 
 def test_a_full_disk_disturbs_no_question(file: Path) -> None:

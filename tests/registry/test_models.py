@@ -176,7 +176,7 @@ def test_refuses(reference: str, code: str) -> None:
     assert "script" not in str(raised.value), "a reason does not repeat an invalid reference"
 
 
-TERMS = "Any use,\nwith the sources named."
+TERMS = "Any use, with the sources named."
 REPLACED = {"old": "new", "old-rbm": "new-rbm"}
 PARENT = {"name": "old", "version": "3.5.0"}
 

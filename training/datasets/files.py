@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import gzip
+import os
 import zlib
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import BinaryIO, Final, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
+from scene_client.untrusted import regular_file
 from training.datasets.records import DatasetError
 
 T = TypeVar("T")
@@ -24,12 +27,15 @@ def read_lines(path: Path, limit: int) -> Iterator[bytes]:
     """Yield the undecoded lines of a file, plain or ``*.gz``: invalid UTF-8 affects one line only.
 
     Raises:
-        DatasetError: the file cannot be read, a line with its end has more bytes than the limit, or
-            all lines exceed `MAX_BYTES`: a small compressed file could fill the memory.
+        DatasetError: the file cannot be read, is a pipe other than the standard input, a line with
+            its end has more bytes than the limit, or all lines exceed `MAX_BYTES`: a small
+            compressed file could fill the memory.
     """
-    opener = gzip.open if path.suffix == ".gz" else open
     try:
-        with opener(path, "rb") as file:
+        with regular_file(path) as plain, ExitStack() as stack:
+            file: BinaryIO | gzip.GzipFile = plain
+            if path.suffix == ".gz":
+                file = stack.enter_context(gzip.open(plain))
             number = size = 0
             while line := file.readline(limit + 1):
                 number, size = number + 1, size + len(line)
@@ -64,8 +70,10 @@ def read_json(path: Path, content: type[T]) -> T:
         DatasetError: the file cannot be read, is not JSON or has another type at a named position.
     """
     try:
-        check_size(path, path.stat().st_size, MAX_BYTES)
-        return TypeAdapter(content).validate_json(path.read_bytes())
+        with regular_file(path) as file:
+            check_size(path, os.fstat(file.fileno()).st_size, MAX_BYTES)
+            text = file.read()
+        return TypeAdapter(content).validate_json(text)
     except OSError as error:
         raise DatasetError.unreadable(path, error) from error
     except ValidationError as error:

@@ -35,7 +35,7 @@ from training.datasets.array_types import Rng
 from training.datasets.files import KNOWLEDGE
 from training.datasets.records import MAX_COUNT, AnnotatedObject, AnnotatedScene, DatasetError
 from training.datasets.tables import Errors, Row, read_table
-from training.datasets.vocabulary import is_placeholder
+from training.datasets.vocabulary import curated_names, is_placeholder
 
 SOURCE: Final = "inventories"  # source name of the written scenes of the repository
 
@@ -184,10 +184,15 @@ class Inventory:
     things: Mapping[str, Thing]  # things of `things.csv` by label; empty without this file
     left_out: Counter[str]  # labels of rows that name no kind of object
 
-    def scenes(self, each: int, seed: int) -> list[AnnotatedScene]:
-        """Draw parts of a number of scenes of each place. The scenes of a place are one group."""
-        described = (*self.things.values(), *shipped_things().values())
-        return written_scenes(self.places, detection_rates(described), each, seed)
+    def scenes(self, each: int, seed: int, *, synonyms: bool = True) -> list[AnnotatedScene]:
+        """Draw parts of a number of scenes of each place. The scenes of a place are one group.
+
+        With `synonyms`, a curated synonym such as "hospital bed" is listed as often as its thing.
+        """
+        rates = detection_rates((*self.things.values(), *shipped_things().values()))
+        if synonyms:
+            rates = _of_synonyms(rates) | rates
+        return written_scenes(self.places, rates, each, seed)
 
 
 @cache
@@ -355,6 +360,16 @@ def detection_rates(things: Iterable[Thing]) -> dict[str, float]:
             rate = 1 - (1 - _SMALLEST) * math.exp(-max(thing.size) / _LENGTH)
             rates.setdefault(label_key(name), rate)
     return rates
+
+
+def _of_synonyms(rates: Mapping[str, float]) -> dict[str, float]:
+    """Return the rates of the curated synonyms of things with a rate."""
+    return {
+        label_key(name): rates[key]
+        for label, names in curated_names().aliases.items()
+        if (key := label_key(label)) in rates
+        for name in names
+    }
 
 
 def detected_part(scene: AnnotatedScene, rates: Mapping[str, float], rng: Rng) -> AnnotatedScene:

@@ -15,16 +15,27 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, StrictBool, StrictInt, ValidationError
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    FailFast,
+    Field,
+    StrictBool,
+    StrictInt,
+    ValidationError,
+)
 
 from app.scene.scene import SMALLEST
 from scene_client.frames import BoxOrigin, Conventions, Extents, QuaternionOrder, Units, Up
-from scene_client.schemas import Stamp
+from scene_client.schemas import MAX_RELATIONS, Stamp
 from training.datasets.files import position_and_problem, read_lines
-from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError, Id, Text
+from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError, Id, Label, Text
 from training.datasets.sources import relations_of, supported_subjects
 
 MAX_LINE: Final = 8 * 2**20
+MAX_SCENES: Final = 250_000  # of a file; each takes about 2 kB of memory
+MAX_OBJECTS: Final = 4096  # of a scene
 
 _NAMES = ("scene_id", "source", "group", "room_type")
 
@@ -43,23 +54,30 @@ def _of_fields(entry: Any) -> Any:
 
 
 class _Objects(BaseModel):
-    objects: list[AnnotatedObject]
+    objects: Annotated[list[AnnotatedObject], FailFast()]
 
 
 _Triple = Annotated[tuple[Id, Text, Id], BeforeValidator(_of_fields)]
 
 
+_Triples = Annotated[list[_Triple], Field(max_length=MAX_RELATIONS)]
+
+
 class _Line(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
-    objects: list[Annotated[dict[str, Any], BeforeValidator(_of_label)]]
+    objects: Annotated[
+        list[Annotated[dict[str, Any], BeforeValidator(_of_label)]],
+        Field(max_length=MAX_OBJECTS),
+        FailFast(),
+    ]
     scene_id: Text | None = None
     source: Text = "jsonl"
     group: Text | None = None
-    room_type: Text | None = None
-    relations: list[_Triple] | None = None
-    false_relations: list[_Triple] | None = None
-    counts: dict[str, StrictInt] | None = None
+    room_type: Label | None = None
+    relations: _Triples | None = None
+    false_relations: _Triples | None = None
+    counts: Annotated[dict[str, StrictInt], Field(max_length=MAX_OBJECTS)] | None = None
     viewer_frame: StrictBool | None = None
     up: Up | None = None
     units: Units = "m"
@@ -81,11 +99,18 @@ def read_jsonl(path: Path) -> list[AnnotatedScene]:
 
 
 def scan_jsonl(path: Path) -> Iterator[AnnotatedScene | DatasetError]:
-    """Yield a scene for each valid line and an error for each invalid line. Skip blank lines."""
+    """Yield a scene for each valid line and an error for each invalid line. Skip blank lines.
+
+    Raises:
+        DatasetError: the file cannot be read, or has more than `MAX_SCENES` lines with scenes.
+    """
     line_of: dict[tuple[str, str], int] = {}
+    count = 0
     for number, line in enumerate(read_lines(path, MAX_LINE), 1):
         if not line.strip():
             continue
+        if (count := count + 1) > MAX_SCENES:
+            raise DatasetError(path, "", f"has more than {MAX_SCENES} scenes")
         try:
             scene = _parse_scene(line, f"{path.name}:{number}")
             first = line_of.setdefault((scene.source, scene.scene_id), number)
@@ -165,14 +190,16 @@ def _objects(
     labels = Counter(str(entry.get("label")) for entry in entries)
     nameless = Counter(str(entry.get("label")) for entry in entries if entry.get("id") is None)
     ids = {str(entry["id"]) for entry in entries if entry.get("id") is not None}
+    last: Counter[str] = Counter()  # number of the last object of each label
     complete = []
     for entry in entries:
-        name, number, label = entry.get("id"), 0, str(entry.get("label"))
+        name, label = entry.get("id"), str(entry.get("label"))
         if name is None:
-            name = label
-            while name in ids or (not number and nameless[label] > 1):
-                number += 1
-                name = f"{label}_{number}"
+            name, is_taken = label, label in ids or nameless[label] > 1
+            while is_taken:
+                last[label] += 1
+                name = f"{label}_{last[label]}"
+                is_taken = name in ids
             ids.add(name)
         count = {"count": counts[label]} if label in counts else {}
         known = {key: value for key, value in entry.items() if key not in _UNUSED}

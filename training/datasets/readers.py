@@ -22,6 +22,7 @@ from typing import Any, Final
 
 from pydantic import BaseModel
 
+from app.model.fields import Many
 from app.scene import RELATIONS, label_key
 from training.datasets.files import read_json
 from training.datasets.jsonl import read_jsonl
@@ -30,9 +31,9 @@ from training.datasets.records import (
     AnnotatedScene,
     DatasetError,
     Id,
+    Label,
     Length,
     Number,
-    Text,
 )
 from training.datasets.sources import relations_of, supported_subjects
 from training.datasets.sunrgbd_mat import read_sunrgbd_mat
@@ -42,26 +43,26 @@ from training.datasets.tables import Errors, read_table
 class _Scan(BaseModel):
     scan: str
     split: int | str | None = None
-    objects: dict[str, Text] | None = None  # labels by object; None: see objects.json
-    relationships: list[tuple[Id, Id, Any, str]]  # subject, object, id and name of the predicate
+    objects: dict[str, Label] | None = None  # labels by object; None: see objects.json
+    relationships: Many[tuple[Id, Id, Any, str]]  # subject, object, id and name of the predicate
 
 
 class _Scans(BaseModel):
-    scans: list[_Scan]
+    scans: Many[_Scan]
 
 
 class _Thing(BaseModel):
     id: Id
-    label: Text
+    label: Label
 
 
 class _LabelledScan(BaseModel):
     scan: str
-    objects: list[_Thing]
+    objects: Many[_Thing]
 
 
 class _LabelledScans(BaseModel):
-    scans: list[_LabelledScan]
+    scans: Many[_LabelledScan]
 
 
 class _Room(BaseModel):
@@ -121,13 +122,13 @@ class _Image(BaseModel):
 
 class _Category(BaseModel):
     id: int
-    name: Text
+    name: Label
 
 
 class _Instances(BaseModel):
-    images: list[_Image]
-    categories: list[_Category]
-    annotations: list[_Annotation]
+    images: Many[_Image]
+    categories: Many[_Category]
+    annotations: Many[_Annotation]
 
 
 def read_coco(path: Path) -> list[AnnotatedScene]:

@@ -13,6 +13,8 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from app.scene import RELATIONS
 from scene_client.frames import Conventions
+from scene_client.schemas import MAX_LABEL
+from scene_client.untrusted import printable
 
 Box2d = tuple[float, float, float, float]
 
@@ -27,6 +29,7 @@ class DatasetError(ValueError):
     """
 
     def __init__(self, path: Path, where: str, problem: str) -> None:
+        problem = printable(problem)
         if len(problem) > MAX_PROBLEM:  # the text can contain a value of several megabytes
             problem = problem[:MAX_PROBLEM] + "…"
         super().__init__(f"{path}, {where}: {problem}" if where else f"{path}: {problem}")
@@ -70,7 +73,15 @@ def _ordered(box: Box2d) -> Box2d:
     return box
 
 
+def _plain(label: str) -> str:
+    if not label.isprintable():
+        raise ValueError("must be one line without control characters")
+    return label
+
+
 Text = Annotated[str, Field(pattern=r"\S")]  # a text that is not blank
+Label = Annotated[Text, Field(max_length=MAX_LABEL), AfterValidator(_plain)]
+"""A label or a room type, which may become a name in a manifest."""
 Id = Annotated[str, BeforeValidator(lambda x: str(x) if type(x) is int else x)]
 """An id: a text, or an integer, which is converted to text."""
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -82,7 +93,7 @@ class AnnotatedObject:
     """One annotated object. None means that a value is unknown."""
 
     id: Id  # distinct within the scene
-    label: Text
+    label: Label
     # Centre (x, y, z) in metres.
     position: Annotated[tuple[Number, Number, Number], BeforeValidator(_of_request)] | None = None
     # Extents before rotation by the yaw, (x, y, z) in metres.

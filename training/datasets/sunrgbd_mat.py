@@ -24,7 +24,7 @@ from scipy.io.matlab import MatReadError
 
 from training.datasets.array_types import Floats
 from training.datasets.files import check_size, position_and_problem
-from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError, Text
+from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError, Label, Text
 
 SOURCE = "sunrgbd-mat"
 
@@ -65,7 +65,7 @@ class _Box(BaseModel):
     basis: Annotated[Any, _finite(3, 3)]
     coeffs: Annotated[Any, _finite(3)]
     centroid: Annotated[Any, _finite(3)]
-    classname: Text
+    classname: Label
 
     def to_object(self, number: int) -> AnnotatedObject:
         """Return the object of the box. Its upright axis has the largest z component."""

@@ -11,11 +11,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
+from scene_client.schemas import MAX_LABEL
 from training.datasets.files import read_lines
 from training.datasets.records import MAX_LISTED, DatasetError, InvalidLinesError
 
 MAX_LINE: Final = 4096
-MAX_ROWS: Final = 1_000_000
+MAX_ROWS: Final = 100_000
 _SEPARATORS: Final = (",", ";", "\t")
 
 
@@ -62,14 +63,22 @@ class Row:
     def __contains__(self, column: str) -> bool:
         return column in self._values
 
+    def require_plain(self) -> None:
+        """Raise DatasetError for a control character, which no name in a manifest may have."""
+        for column, value in self._values.items():
+            if not value.isprintable():
+                raise self.error(column, "must be one line without control characters")
+
     def optional(self, column: str) -> str:
         """Return a text, which is empty for an empty cell and for a column that the file lacks."""
         return self._values.get(column, "")
 
     def text(self, column: str) -> str:
-        """Return a text. Raise DatasetError if it is empty."""
+        """Return a text. Raise DatasetError if it is empty, or longer than a label."""
         if not (value := self.optional(column)):
             raise self.error(column, "is empty")
+        if len(value) > MAX_LABEL:
+            raise self.error(column, f"has more than {MAX_LABEL} characters")
         return value
 
     def one_of(self, column: str, choices: Sequence[str]) -> str:
@@ -114,7 +123,10 @@ def read_table(
                 problem = f"the row has {len(values)} values, not {len(names)}"
                 errors.add(DatasetError(path, f"line {line}", problem))
                 continue
-            yield Row(path, line, dict(zip(names, map(str.strip, values), strict=True)))
+            row = Row(path, line, dict(zip(names, map(str.strip, values), strict=True)))
+            with errors.collected():
+                row.require_plain()
+                yield row
     except csv.Error as error:
         errors.add(DatasetError(path, f"line {line + 1}", f"is no row: {error}"))
     except DatasetError as error:

@@ -28,13 +28,14 @@ from app.registry import (
 )
 from app.registry.references import AliasTarget
 from training.datasets import AnnotatedScene, DatasetError
+from training.datasets.console import console, print_lines
 from training.datasets.records import digest_of
 from training.datasets.vocabulary import left_out_line
 from training.domain.adaptation import FEWEST, Adapted, Measured, adapted
 from training.domain.home import JUDGED, MAX_ALARMS, MAX_CLASSES, Home, confirmed_scene
 from training.domain.look import of_convention
 from training.domain.material import read_material
-from training.domain.terminal import ROWS, StorePath, console, fail, print_finding, print_lines
+from training.domain.terminal import ROWS, StorePath, fail, print_finding
 from training.evaluation.metrics import Ratio
 from training.fit.configuration import ConfigError
 from training.runs.example_scenes import choose_examples
@@ -256,7 +257,13 @@ def _description(
         spec=model.spec.to_dict(),
         vocabulary=VocabularyEntry.of(model.vocabulary, model.spec.A, manifest.vocabulary.profiles),
         calibration=_calibration(home, model),
-        training={"parent": origin, "seed": seed, "confirmed": home.confirmed},
+        training={
+            "parent": origin,
+            "seed": seed,
+            "confirmed": home.confirmed,
+            "recorded": len(recorded),
+            "written": len(written),
+        },
         data=(*manifest.data, *sources),
         metrics=tuple(_metrics(result.measured, own)),
         terms=manifest.terms,

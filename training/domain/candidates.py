@@ -12,7 +12,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from app.model import SceneModel
-from app.registry import Store, StoreError
+from app.registry import DataSource, Store, StoreError
 from app.scene import Vocabulary
 from training.datasets import AnnotatedScene, split
 from training.datasets.batches import TrainingData, has_relations
@@ -25,9 +25,9 @@ from training.evaluation.report import Progress
 from training.evaluation.selection import Baseline
 from training.evaluation.setting import Model
 from training.fit.configuration import Config, ConfigError, source_name
-from training.runs.folder import RunError, load_run
-from training.runs.pipeline import prepare
-from training.runs.publish import calibrated_draft
+from training.runs.folder import FinishedRun, RunError, load_run
+from training.runs.pipeline import SplitScenes, prepare
+from training.runs.publish import calibrated_draft, data_sources, terms
 
 BASELINES = "baselines"
 """Name of the baselines as a candidate: EASE for objects, a frequency table for relations, and
@@ -40,10 +40,16 @@ class Candidate:
 
     title: str  # name of the model in tables
     config: Config | None
-    learnt: dict[str, str]  # digest of each data source of the training, by source name
+    sources: tuple[DataSource, ...]  # data of the training
     scene_model: SceneModel | None  # None for the baselines
     data: Path | None = None  # folder with the scene files of a run
     tasks: frozenset[str] = frozenset()  # tasks of the figures on the card of a published model
+    terms: str = ""  # of the weights
+
+    @property
+    def learnt(self) -> dict[str, str]:
+        """Digest of each data source of the training, by source name."""
+        return {source.source: source.digest for source in self.sources}
 
     @property
     def vocabulary(self) -> Vocabulary | None:
@@ -71,7 +77,15 @@ def run_candidate(folder: Path, data: Path | None, say: Progress) -> Candidate:
     scenes = prepare(run.config, root)
     run.require(scenes.digest)
     say(f"calibrating {folder}")
-    return Candidate(str(folder), run.config, scenes.digests, calibrated_draft(run, scenes), root)
+    return of_run(str(folder), run, scenes, calibrated_draft(run, scenes), root)
+
+
+def of_run(
+    title: str, run: FinishedRun, scenes: SplitScenes, model: SceneModel, root: Path
+) -> Candidate:
+    """Return the calibrated model of a run as a candidate."""
+    sources = data_sources(scenes)
+    return Candidate(title, run.config, sources, model, root, terms=terms(sources))
 
 
 def stored_candidate(reference: str, store: Store) -> Candidate:
@@ -82,16 +96,18 @@ def stored_candidate(reference: str, store: Store) -> Candidate:
         config = Config.model_validate(artifact.manifest.training.get("config"))
     except ValidationError:
         config = None
-    learnt = {source.source: source.digest for source in artifact.manifest.data}
-    tasks = frozenset(metric.task for metric in artifact.manifest.metrics)
-    return Candidate(f"{name}@{version}", config, learnt, artifact.model, tasks=tasks)
+    manifest = artifact.manifest
+    return Candidate(
+        f"{name}@{version}", config, manifest.data, artifact.model,
+        tasks=frozenset(metric.task for metric in manifest.metrics), terms=manifest.terms,
+    )  # fmt: skip
 
 
 def find(reference: str, store: Store, data: Path | None, say: Progress) -> Candidate:
     """Return the candidate that a reference names: a folder of a run, `BASELINES`, or a model."""
     if reference == BASELINES:
         # The baselines are fitted later, on the training scenes of the other candidate.
-        return Candidate(BASELINES, None, {}, None)
+        return Candidate(BASELINES, None, (), None)
     folder = Path(reference)
     if (folder / "config.json").is_file():
         return run_candidate(folder, data, say)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,17 +13,28 @@ import numpy as np
 import typer
 from rich import box
 from rich.table import Table
+from rich.text import Text
 from torch import Tensor
 
-from app.registry import DEFAULT_STORE, RegistryError, Store
+from app.registry import DEFAULT_STORE, Metric, RegistryError, Store
+from app.registry.summary import (
+    judges_not,
+    knows,
+    lengths_of_lists,
+    shares_of_alarms,
+    trained_on,
+    use,
+)
 from training.datasets import AnnotatedScene, DatasetError, annotated_classes, encode
 from training.datasets.batches import SceneTensors, scene_tensors
 from training.datasets.cases import some_scenes
+from training.datasets.console import console, print_lines
 from training.datasets.files import DATA
 from training.domain.candidates import BASELINES, Candidate, find, held_out
-from training.domain.terminal import StorePath, console, fail, print_lines
+from training.domain.terminal import StorePath, fail
 from training.domain.translation import Translation, same_classes
 from training.evaluation.metrics import Figure
+from training.evaluation.outlier_tasks import LENGTHS
 from training.evaluation.report import Progress, measure, silent
 from training.evaluation.results import Difference, Results, only, summarise
 from training.evaluation.setting import Model, Setting
@@ -31,6 +43,8 @@ from training.fit.configuration import ConfigError
 from training.runs.folder import RunError
 from training.runs.pipeline import read_sources, split_and_encode
 
+ALARMS = "T3 alarms"
+
 COMPARED: dict[str, tuple[str, ...]] = {
     "T2 missing": ("MRR, one removed", "MRR, 25 % shown", "top-1", "top-10"),
     "T2-at missing at a place": ("MRR",),
@@ -38,8 +52,15 @@ COMPARED: dict[str, tuple[str, ...]] = {
     "T1a relations": ("R-precision, instance counts", "R-precision, distinct classes"),
     "T1b completion": ("R-precision",),
     "T3b placement": ("hit@1",),
+    ALARMS: tuple(f"alarms, medium, {n} classes" for n in LENGTHS if n > 1),
 }
-"""Metrics to compare, by task; the first is its primary metric. Higher is better for all."""
+"""Metrics to compare, by task."""
+
+PRIMARY = {task: names[0] for task, names in COMPARED.items() if task != ALARMS}
+"""The metric of a task that can prevent a promotion; higher is better for all. `publish` limits the
+alarms of a model by itself."""
+
+MARGIN = 0.02  # accepted loss of a primary metric when a new version replaces the served version
 
 RELATIONAL = ("T1a relations", "T1b completion", "T2-at missing at a place", "T3b placement")
 """Tasks that need scenes with relations."""
@@ -60,6 +81,7 @@ class Comparison:
     notes: tuple[str, ...]
     # Relation tasks on the card of the second model, if this comparison measures no relation task.
     unmeasured: tuple[str, ...] = ()
+    about: tuple[str, ...] = ()  # sentences: data, knowledge, limits and use of the first model
 
     @property
     def a(self) -> str:
@@ -69,12 +91,74 @@ class Comparison:
     def worse_by(self, margin: float) -> list[Difference]:
         """Return the primary metrics whose whole interval of the difference is below -margin."""
         rows = self.results.differences
-        return [r for r in rows if r.metric == COMPARED[r.task][0] and r.figure.high < -margin]
+        return [r for r in rows if PRIMARY.get(r.task) == r.metric and r.figure.high < -margin]
+
+    def objections(self, margin: float) -> list[str]:
+        """Return the reasons against a promotion of the first model."""
+        a, b, reasons = self.a, self.b, []
+        if rows := self.worse_by(margin):
+            names = ", ".join(f"{_name(row)} {row.figure}" for row in rows)
+            reasons.append(f"{a} is worse than {b} by more than {margin}: {names}")
+        if self.unmeasured:
+            names = ", ".join(map(in_words, self.unmeasured))
+            reasons.append(
+                f"{b} was measured in {names}, but {a} was not, because the compared scenes "
+                "contain no relations"
+            )
+        return reasons
+
+    def accepted(self, margin: float) -> str:
+        """Return a sentence that says why other losses prevent no promotion, or ""."""
+        certain, reasons = self.worse_by(margin), []
+        for row in self.results.differences:
+            if row.verdict == "worse" and row not in certain:
+                is_primary = PRIMARY.get(row.task) == row.metric
+                reason = (
+                    f"not certainly by more than {margin}" if is_primary else "not a primary metric"
+                )
+                reasons.append(f"{_name(row)} ({reason})")
+        return f"These losses prevent no promotion: {'; '.join(reasons)}." if reasons else ""
+
+    def summary(self, margin: float = MARGIN) -> list[str]:
+        """Return five sentences on the first model: data, knowledge, alarms, limits, advice."""
+        origin, knowledge, limits, use = self.about
+        return [origin, knowledge, self._alarms(), limits, f"{self._advice(margin)} {use}"]
+
+    def _alarms(self) -> str:
+        """Return the sentence about wrong alarms in the compared scenes."""
+        own, other = (
+            [
+                Metric(task=ALARMS, source=c.source, metric=c.metric, **asdict(c.figure))
+                for c in self.results.cells
+                if (c.row, c.task) == (title, ALARMS)
+            ]
+            for title in (self.a, self.b)
+        )
+        if not own:
+            return "How often A raises a wrong alarm is unknown: the held-out scenes are too short."
+        (share,) = shares_of_alarms(own).values()
+        of_b = "".join(f" (B: {value})" for value in shares_of_alarms(other).values())
+        return (
+            f"With the default sensitivity, A raises a wrong alarm in {share}{of_b} of "
+            f"{share.lists:,} lists of {lengths_of_lists(own)} things from unchanged held-out "
+            "scenes."
+        )
+
+    def _advice(self, margin: float) -> str:
+        """Return whether to promote the first model."""
+        if reasons := self.objections(margin):
+            return f"Do not promote A: {'; '.join(reasons)}."
+        n = Counter(row.verdict for row in self.results.differences)
+        counts = f"better in {n['better']} of {n.total()} metrics and worse in {n['worse']}"
+        if not n["better"]:
+            return f"A promotion of A brings no certain gain: A is {counts}."
+        return f"Promote A: it is {counts}."
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-serialisable dictionary with the results and all other attributes."""
         attributes = asdict(self)
         attributes.pop("results")
+        attributes["summary"] = self.summary() if attributes.pop("about") else []
         return self.results.to_dict() | {"a": self.a} | attributes
 
 
@@ -93,7 +177,7 @@ def compare_command(
     store: StorePath = DEFAULT_STORE,
     output: Annotated[Path | None, typer.Option("--json", help="write all results here")] = None,
 ) -> None:
-    """Compare two models on scenes held out from both.
+    """Compare two models on scenes held out from both, and say whether to promote the first one.
 
     The scenes are the test scenes of the first model, without scenes that the second model learnt
     from. The table shows the difference of each metric with its paired 95 % interval. The bootstrap
@@ -112,10 +196,11 @@ def compare_command(
     if output is not None:
         text = json.dumps(comparison.to_dict(), indent=1, ensure_ascii=False)
         output.write_text(text + "\n", encoding="utf-8")
-    show(comparison)
+    print_lines(*comparison.summary(), "")
+    show(comparison, MARGIN)
 
 
-def show(comparison: Comparison) -> None:
+def show(comparison: Comparison, margin: float) -> None:
     """Print the metrics of a comparison as a table, with its notes."""
     titles = (comparison.a, comparison.b)
     heading = f"{comparison.scenes} held-out scenes of {comparison.groups} groups"
@@ -129,21 +214,26 @@ def show(comparison: Comparison) -> None:
     for row in comparison.results.differences:
         if row.task != task:
             task = row.task
-            table.add_row(f"[bold]{in_words(task)}[/bold]")
+            table.add_row(Text(in_words(task), "bold"))
         colour = _COLOURS.get(row.verdict, "dim")
         table.add_row(
             f"  {row.metric}",
             *(f"{values[name, row.task, row.metric]:.3f}" for name in titles),
             difference_text(row.figure),
-            f"[{colour}]{row.verdict}[/{colour}]",
+            Text(row.verdict, colour),
         )
     console.print(table)
+    print_lines(*filter(None, [comparison.accepted(margin)]))
     notes = list(comparison.notes)
     if comparison.unmeasured:
         names = ", ".join(map(in_words, comparison.unmeasured))
         notes.append(f"{comparison.a} was not measured in {names}: the scenes contain no relations")
     for note in notes:
-        console.print(f"note: {note}", markup=False, soft_wrap=True)
+        console.print(f"note: {note}", soft_wrap=True)
+
+
+def _name(row: Difference) -> str:
+    return f"{in_words(row.task)}, {row.metric}"
 
 
 def difference_text(figure: Figure) -> str:
@@ -183,6 +273,21 @@ def compare(a: Candidate, b: Candidate, root: Path, *, say: Progress) -> Compari
         groups=len({scene.group for scene in scenes.scenes}),
         notes=(*remarks, *_notes(a, b, test)),
         unmeasured=unmeasured(results.differences, b),
+        about=_about(a),
+    )
+
+
+def _about(model: Candidate) -> tuple[str, ...]:
+    """Return the sentences about the first model that need no scenes; see `Comparison.about`."""
+    drawn = 0 if model.config is None else model.config.data.written
+    if model.scene_model is None:
+        return ()
+    words, calibration = model.scene_model.vocabulary, model.scene_model.calibration
+    return (
+        trained_on("A", model.sources, drawn),
+        knows("A", words, calibration),
+        judges_not("A", words, calibration),
+        use(model.sources, model.terms),
     )
 
 

@@ -10,12 +10,14 @@ import torch
 import typer
 from rich import box
 from rich.table import Table
+from rich.text import Text
 
 from app.registry import DEFAULT_STORE, Artifact, Metric, RegistryError, Store
 from training.datasets import DatasetError
 from training.datasets.batches import subset
+from training.datasets.console import console, print_lines
 from training.datasets.files import DATA
-from training.domain.terminal import StorePath, console, fail, print_lines
+from training.domain.terminal import StorePath, fail
 from training.evaluation.everyday_task import EVERYDAY
 from training.evaluation.metrics import Figure
 from training.evaluation.report import Progress, RoomList, evaluate, read_test
@@ -129,6 +131,6 @@ def _show(tables: Figures, title: str | None = None) -> None:
     for (task, metric, source), values in sorted(figures.items(), key=lambda item: item[0][0]):
         if task != heading:
             heading = task
-            table.add_row(f"[bold]{in_words(task)}[/bold]")
+            table.add_row(Text(in_words(task), "bold"))
         table.add_row(f"  {metric}", source, *(values.get(name, "") for name in tables))
     console.print(table)

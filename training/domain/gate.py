@@ -1,8 +1,8 @@
 """Decide whether an alias may point at a new version.
 
 First, the new version must be useful: `Usefulness.objections`. Then it is compared with the version
-that the alias serves, on common held-out scenes: `losses`. docs/decisions/own-scenes.md gives the
-reasons for the rules.
+that the alias serves, on common held-out scenes: `Comparison.objections`.
+docs/decisions/own-scenes.md gives the reasons for the rules.
 """
 
 from __future__ import annotations
@@ -20,16 +20,14 @@ from app.registry.references import AliasTarget
 from training.datasets.batches import TrainingData, subset
 from training.datasets.cases import some_scenes
 from training.domain.candidates import Candidate, stored_candidate
-from training.domain.compare import SCENES, Comparison, difference_text
+from training.domain.compare import SCENES, difference_text
 from training.evaluation.asking import score_missing
 from training.evaluation.baselines import EASE, POPULARITY
 from training.evaluation.metrics import FEWEST_GROUPS, Figure, Ratio, paired_difference
 from training.evaluation.object_tasks import rank_missing
 from training.evaluation.report import Progress
 from training.evaluation.setting import ObjectScore
-from training.evaluation.tasks import in_words
 
-MARGIN = 0.02  # accepted loss of a primary metric when a new version replaces the served version
 LEAST_LEAD = 0.02
 """Minimum lead of a new version over popularity, in MRR. A smaller lead is of no use, even if it is
 certain: a model that is trained on shuffled labels can lead by 0.006."""
@@ -133,18 +131,3 @@ def served_model(store: Store, alias: str) -> ServedModel:
     except (ArtifactError, StoreError) as error:
         note = f"no comparison: the model served as {alias} cannot be read ({error})"
         return ServedModel(target, None, note)
-
-
-def losses(comparison: Comparison, margin: float) -> list[str]:
-    """Return the reasons against the first model of a comparison."""
-    a, b, reasons = comparison.a, comparison.b, []
-    if rows := comparison.worse_by(margin):
-        names = ", ".join(f"{in_words(row.task)}, {row.metric} {row.figure}" for row in rows)
-        reasons.append(f"{a} is worse than {b} by more than {margin}: {names}")
-    if comparison.unmeasured:
-        names = ", ".join(map(in_words, comparison.unmeasured))
-        reasons.append(
-            f"{b} was measured in {names}, but {a} was not, because the compared scenes contain "
-            "no relations"
-        )
-    return reasons

@@ -12,6 +12,7 @@ import typer
 
 from app.scene import label_key
 from training.datasets import DatasetError, generate_rooms
+from training.datasets.console import console, print_lines, print_marked
 from training.datasets.files import write_whole
 from training.datasets.jsonl import write_jsonl
 from training.datasets.rooms import DOMAINS
@@ -19,7 +20,7 @@ from training.datasets.vocabulary import left_out_line, vocabulary_json
 from training.domain.look import Label
 from training.domain.material import read_material
 from training.domain.proposal import Proposal, propose
-from training.domain.terminal import ROWS, console, fail, listing, print_finding, print_lines
+from training.domain.terminal import ROWS, fail, listing, print_finding
 from training.domain.update import PROPOSED, proposed_json, update
 from training.fit.configuration import ConfigError
 from training.runs.config_files import shipped_configs
@@ -96,7 +97,7 @@ def init(
     _show(proposal, f"classes {written}with at least {proposal.minimum} mentions")
     # With written places, the next command also publishes the model.
     lines = _next(name, folder, promoted=not material.places)
-    print_lines(f"\nwritten: {', '.join(map(str, targets))}", *lines)
+    print_lines("", f"written: {', '.join(map(str, targets))}", *lines)
 
 
 def _update(name: str, folder: Path, files: Sequence[Path]) -> None:
@@ -114,7 +115,8 @@ def _update(name: str, folder: Path, files: Sequence[Path]) -> None:
     kept = "the settings" if result.sources else f"{name}.toml"
     print_lines(
         *lines,
-        f"\nwritten: {', '.join(map(str, result.files)) or 'nothing'}",
+        "",
+        f"written: {', '.join(map(str, result.files)) or 'nothing'}",
         f"kept as they are: the earlier classes, {kept} and the examples",
         *_next(name, folder, promoted=not result.proposal.material.places),
     )
@@ -170,7 +172,7 @@ def _show(proposal: Proposal, classes: str) -> None:
     for finding in facts.findings:
         print_finding(finding)
     if proposal.warning:
-        console.print(f"[yellow]warning:[/yellow] {proposal.warning}", soft_wrap=True)
+        print_marked("warning:", "yellow", proposal.warning)
 
 
 def example(

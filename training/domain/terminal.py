@@ -1,4 +1,4 @@
-"""What the commands of training share: console, errors, lists, progress, option of the store."""
+"""What the commands of training share: errors, lists, progress, option of the store."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Annotated, Final, NoReturn
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.text import Text
 
 from app.registry import RegistryError
+from training.datasets.console import console, print_lines, print_marked
 from training.datasets.records import InvalidLinesError
 from training.domain.look import Finding
 from training.fit.trainer import SCORES, CurvePoint, Trainer
@@ -22,14 +22,6 @@ ROWS: Final = 12  # maximum number of entries of a printed list
 StorePath = Annotated[
     str, typer.Option("--store", envvar="SCENE_STORE", help="folder of the model store")
 ]
-
-console = Console()
-
-
-def print_lines(*lines: str) -> None:
-    """Print lines as they are: without markup, colours and line breaks."""
-    for line in lines:
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def listing(title: str, entries: Sequence[str]) -> list[str]:
@@ -47,7 +39,7 @@ def fail(error: Exception) -> NoReturn:
         further = [f"  {error.path.name}, {line.where}: {line.problem}" for line in error.errors]
         more = error.count - len(error.errors)
         further += [f"  and {more} more"] if more else []
-    console.print(f"[red]error:[/red] {escape(reason)}", soft_wrap=True)
+    print_marked("error:", "red", reason)
     print_lines(*further)
     raise typer.Exit(1) from None
 
@@ -100,7 +92,7 @@ def next_steps(folder: Path) -> None:
 
 def print_finding(finding: Finding) -> None:
     """Print a property of the scenes that the user should check."""
-    console.print(f"  [yellow]{finding.count}[/yellow] × {finding.what}")
+    console.print(Text.assemble("  ", (str(finding.count), "yellow"), f" × {finding.what}"))
     console.print(f"    {finding.advice}")
     for example in finding.examples:
-        console.print(f"    - {example}", markup=False)
+        print_lines(f"    - {example}")

@@ -12,12 +12,20 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from app.model import Sensitivity
 from app.scene import Vocabulary
 from training.datasets.batches import Batch
-from training.evaluation.setting import Model, ObjectScore, PlacedScore, Places, RelationScore
+from training.evaluation.setting import (
+    Flagged,
+    Model,
+    ObjectScore,
+    PlacedScore,
+    Places,
+    RelationScore,
+)
 
 BEYOND = 1e9  # absolute score of unknown classes: finite, and larger than all log-odds
 
@@ -53,6 +61,7 @@ class Translation:
         wrapper_of: dict[str, Callable[[Any], Any]] = {
             "missing": self._objects,
             "suspicion": self._objects,
+            "flags": self._flags,
             "at_place": self._placed,
             "relations": self._relations,
             "completion": self._relations,
@@ -78,6 +87,16 @@ class Translation:
 
     def _objects(self, score: ObjectScore) -> ObjectScore:
         return lambda v: self.scores(score(self.presence(v)))
+
+    def _flags(self, flags: Flagged) -> Flagged:
+        def flag_scene_classes(
+            v: Float[Tensor, "B V"], sensitivity: Sensitivity
+        ) -> Bool[Tensor, "B V"]:
+            """Return the flags of the listed classes that the model has; the others get none."""
+            flagged = flags(self.presence(v), sensitivity)[:, self.model_class.clamp(min=0)]
+            return flagged & (self.model_class >= 0) & (v > 0)
+
+        return flag_scene_classes
 
     def _placed(self, score: PlacedScore) -> PlacedScore:
         def score_scene_classes(places: Places) -> Tensor:

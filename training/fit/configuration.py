@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 from operator import not_
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from app.inference.variants import VARIANTS, Variant
+from app.model.fields import Text, require_printable
 from training.datasets.files import position_and_problem
 from training.datasets.sources import is_inventory
 from training.machines import MachineSpec, build
@@ -30,6 +31,14 @@ def source_name(source: str) -> str:
     return name.partition(".")[0] if is_file(source) and not is_inventory(name) else name
 
 
+def _joined(text: str) -> str:
+    return require_printable(" ".join(text.split()))
+
+
+Line = Annotated[str, AfterValidator(_joined)]
+"""A text that may have several lines in the file. The manifest has it on one."""
+
+
 class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -42,8 +51,8 @@ class DataConfig(_Section):
     repository. Any other name means the file `<name>.jsonl.gz` in the data folder (`data_folder`).
     """
 
-    sources: tuple[str, ...] = Field(min_length=1)
-    vocabulary: str = "written"  # written, source, rooms, or a file that ends in .json
+    sources: tuple[Text, ...] = Field(min_length=1)
+    vocabulary: Text = "written"  # written, source, rooms, or a file that ends in .json
     split: Literal["group", "stable", "final"] = "group"
     split_seed: int = 0
     rooms: int = Field(default=0, ge=0)  # scenes to generate where `rooms` is a source
@@ -52,7 +61,7 @@ class DataConfig(_Section):
     written: int = Field(default=0, ge=0, exclude_if=not_)
     limit: int | None = Field(default=None, ge=10)  # maximum scenes of each source
     words: bool = False  # whether word vectors tell similar classes
-    terms: str = Field(default="", exclude_if=not_)  # terms of use of own files
+    terms: Line = Field(default="", exclude_if=not_)  # terms of use of own files
     research_only: bool = Field(default=False, exclude_if=not_)
 
     @model_validator(mode="after")
@@ -146,9 +155,9 @@ class Config(_Section):
     """The complete configuration of a training run."""
 
     name: str = Field(pattern=r"^[a-z0-9]+(-[a-z0-9]+)*$")
-    description: str = ""
+    description: Line = ""
     # Example scenes for the visual page: indoor, or a file in the data folder that ends in .json.
-    examples: str = Field(default="", exclude_if=not_)  # empty: none
+    examples: Line = Field(default="", exclude_if=not_)  # empty: none
     data: DataConfig
     machine: MachineConfig
     objects: ObjectsConfig = ObjectsConfig()

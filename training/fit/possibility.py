@@ -137,7 +137,8 @@ def _written_weights() -> Float[NDArray[np.float32], "4 features"]:
     """
     vocabulary, inventory = written_vocabulary(), shipped_inventory()
     possible = stated_pairs(map(complete_scene, inventory.places), vocabulary)
-    impossible = denied_pairs(encode(inventory.scenes(1, seed=0), vocabulary), vocabulary)
+    drawn = inventory.scenes(1, seed=0, synonyms=False)  # as in the shipped models
+    impossible = denied_pairs(encode(drawn, vocabulary), vocabulary)
     prior = describe(vocabulary, inventory.things, _NEUTRAL)
     return _fit_weights(prior, vocabulary, possible, impossible)
 

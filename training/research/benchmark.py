@@ -17,8 +17,8 @@ import typer
 from pydantic import BaseModel, Field, ValidationError
 
 from training.datasets.batches import seen_triples
+from training.datasets.console import console
 from training.datasets.files import write_whole
-from training.domain.terminal import console
 from training.evaluation.calibration_task import NAMES
 from training.evaluation.everyday_task import EVERYDAY, facts_file
 from training.evaluation.metrics import Scored
@@ -179,7 +179,7 @@ def compare_machines(
     text = "\n\n".join([f"# {folder.name}", table, *remarks, results.markdown(shown)])
     write_whole(folder / "results.md", text)
     write_whole(folder / "results.json", json.dumps(contents | results.to_dict(), indent=1) + "\n")
-    console.print(*remarks, sep="\n", markup=False, soft_wrap=True)
+    console.print(*remarks, sep="\n", soft_wrap=True)
     write_plots(folder, [config.name for config in configs], reports)
     console.print(f"all results: results.md, results.json and plots in {folder}", soft_wrap=True)
 

@@ -40,7 +40,7 @@ from app.scene.spatial_relations import STACKED
 from training.datasets import DatasetError
 from training.datasets.batches import SceneTensors, TrainingData, subset
 from training.datasets.cases import some_scenes
-from training.domain.terminal import console
+from training.datasets.console import console, print_marked
 from training.evaluation.asking import artifact_model, ask_rows
 from training.evaluation.baselines import PLACED, frequency, placed_product
 from training.evaluation.generation_task import held_out_scenes, independent_scenes
@@ -233,7 +233,7 @@ def resumable() -> Iterator[None]:
     try:
         yield
     except expected as error:
-        console.print(f"[red]error:[/red] {error}")
+        print_marked("error:", "red", str(error))
         raise typer.Exit(1) from None
     except KeyboardInterrupt:
         console.print("stopped; run the same command again to continue")

@@ -30,8 +30,8 @@ import typer
 from pydantic import BaseModel, ValidationError
 
 from training.datasets.batches import TrainingData
+from training.datasets.console import console
 from training.datasets.files import write_whole
-from training.domain.terminal import console
 from training.evaluation.asking import score_missing, score_relations
 from training.evaluation.metrics import Metric, paired_difference
 from training.evaluation.report import SourceReport, measure, pooled
@@ -201,10 +201,10 @@ class Search:
         try:
             metrics = self.metrics_of(trial.params, report)
         except (FloatingPointError, optuna.TrialPruned) as error:
-            console.print(f"{shown(trial.params)}: {error}", markup=False)
+            console.print(f"{shown(trial.params)}: {error}")
             raise optuna.TrialPruned from error
         figures = ", ".join(f"{name} {metric.figure()}" for name, metric in metrics.items())
-        console.print(f"{shown(trial.params)}: {figures}", markup=False)
+        console.print(f"{shown(trial.params)}: {figures}")
         return sum(metric.value for metric in metrics.values())
 
     def metrics_of(
@@ -270,5 +270,5 @@ def _write_best(
     path = search.folder / "best.toml"
     text = "".join(f"# {line}\n" for line in comment) + "\n" + config_toml(tuned)
     path.write_text(text, encoding="utf-8")
-    console.print("\n".join(comment), markup=False)
+    console.print("\n".join(comment))
     console.print(f"best configuration: {path}")

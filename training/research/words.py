@@ -45,8 +45,9 @@ from app.scene.vocabulary import Word
 from app.scene.words import word_vectors
 from training.datasets import EncodedScene
 from training.datasets.cases import scene_rng
+from training.datasets.console import console
 from training.datasets.files import DATA, write_whole
-from training.domain.terminal import StorePath, console
+from training.domain.terminal import StorePath
 from training.evaluation.metrics import Ratio, paired_difference
 from training.fit.configuration import Config, ConfigError
 from training.fit.draft import draft_artifact

@@ -124,7 +124,7 @@ def _usable(scene: AnnotatedScene, vocabulary: Vocabulary) -> list[tuple[int, An
         (index, thing)
         for index, thing in zip(indices, scene.objects, strict=True)
         if index is not None and not vocabulary.structure[index]
-        if len(label := vocabulary.labels[index]) <= MAX_LABEL and label.isprintable()
+        if len(vocabulary.labels[index]) <= MAX_LABEL
     ]
 
 

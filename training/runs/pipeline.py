@@ -105,7 +105,10 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
         if source == "rooms":
             own = generate_rooms(data.rooms, seed=data.split_seed)
         elif is_inventory(source):
-            own = inventories.read_inventory(path).scenes(data.written, seed=data.split_seed)
+            # The shipped models learnt from draws without synonyms: others would be other data.
+            own = inventories.read_inventory(path).scenes(
+                data.written, seed=data.split_seed, synonyms=source != inventories.SOURCE
+            )
         elif source == PRIORS:
             own = read_prior_scenes(path)
         else:

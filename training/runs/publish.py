@@ -227,17 +227,23 @@ def _measure(
     return evaluate(model, *scenes, everyday=EVERYDAY, tasks=tasks, progress=progress)
 
 
-def data_sources(scenes: SplitScenes, learnt: ObjectScenes) -> tuple[DataSource, ...]:
-    """Return the data sources, with their shares of the weight in the training of objects."""
-    sources = []
-    share_of = dict(zip(learnt.sources, (learnt.source_sizes / learnt.size).tolist(), strict=True))
+def data_sources(scenes: SplitScenes, learnt: ObjectScenes | None = None) -> tuple[DataSource, ...]:
+    """Return the data sources, with their shares of the weight in the training of objects.
+
+    Without `learnt`, the shares are not recorded.
+    """
+    sources, share_of = [], {}
+    if learnt is not None:
+        shares = (learnt.source_sizes / learnt.size).tolist()
+        share_of = dict(zip(learnt.sources, shares, strict=True))
     written = {source_name(source) for source in scenes.data.sources if is_inventory(source)}
     for name, count in scenes.counts.items():
         words, research_only = terms_of(name, scenes.data)
         digest = scenes.digests[name]
         source = DataSource(
             source=name, scenes=count, digest=digest, terms=words, research_only=research_only,
-            share=round(share_of.get(name, 0.0), 4), written=name in written,
+            share=None if learnt is None else round(share_of.get(name, 0.0), 4),
+            written=name in written,
         )  # fmt: skip
         sources.append(source)
     return tuple(sources)

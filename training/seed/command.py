@@ -23,9 +23,9 @@ from typing import Annotated, Any, Final
 
 import torch
 import typer
-from rich.console import Console
 
 from training.datasets import DatasetError
+from training.datasets.console import console, print_marked
 from training.datasets.files import DATA, write_whole
 from training.seed.machines import EPOCHS, KINDS, LEARNING_RATE, VARIANTS, train
 from training.seed.protocol import (
@@ -39,8 +39,6 @@ from training.seed.protocol import (
     nothing_answer,
 )
 from training.seed.scenes import Material, read_material
-
-console = Console()
 
 Job = tuple[str, str, int]  # split, variant and training seed of a machine
 Run = dict[str, Any]  # figures of a machine, and the errors of each epoch
@@ -77,7 +75,7 @@ def seed(
         run_job = partial(_run, source=source, data=data, folder=folder, settings=settings)
         runs = _train_all(run_job, list(product(materials, VARIANTS, range(seeds))), workers)
     except (DatasetError, FolderError, FloatingPointError) as error:
-        console.print(f"[red]error:[/red] {error}", soft_wrap=True)
+        print_marked("error:", "red", str(error))
         raise typer.Exit(1) from None
     except KeyboardInterrupt:
         console.print("stopped; run the same command again to continue")
@@ -97,7 +95,7 @@ def seed(
     write_whole(folder / "results.json", json.dumps({"paper": PAPER, "splits": results}, indent=1))
     write_whole(folder / "results.md", page)
     plot(folder / "errors.png", results)
-    console.print(page, markup=False, highlight=False, soft_wrap=True)
+    console.print(page, highlight=False, soft_wrap=True)
     console.print(f"results: {folder}/results.md, results.json, errors.png", soft_wrap=True)
 
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         HomeFileError,
         InvalidRequestError,
         ProblemError,
+        UnknownThingError,
         UnreachableError,
     )
     from scene_client.files import from_file, rooms_from_file
@@ -34,7 +35,8 @@ __version__ = "2.0.0"
 __all__ = [
     "AnswerError", "AsyncClient", "Client", "ClientError", "DeadlineError", "Event", "Home",
     "HomeFileError", "InvalidRequestError", "MessageError", "OfflineClient", "ProblemError",
-    "Recorder", "Settings", "UnreachableError", "from_data", "from_file", "rooms_from_file",
+    "Recorder", "Settings", "UnknownThingError", "UnreachableError", "from_data", "from_file",
+    "rooms_from_file",
 ]  # fmt: skip
 
 # Maps each name to the module that defines the name. The package imports the module on first use of

@@ -37,6 +37,12 @@ from scene_client.offline import OfflineClient
 from scene_client.ros_fields import MessageError
 from scene_client.schemas import Detail, Sensitivity, UnknownLabels
 from scene_client.sync import Client
+from scene_client.untrusted import (
+    printable,
+    printable_answer,
+    printable_json,
+    printable_lines,
+)
 
 REFUSED, MEANINGLESS, UNREACHABLE, LATE, BUSY, FAILED = range(1, 7)
 
@@ -121,8 +127,9 @@ def _show(
     with _exit_on_error(), options.client(_api_key()) as client:
         answer = question(client)
     if options.as_json:
-        print(answer.model_dump_json(exclude_unset=True))
+        print(printable_json(answer.model_dump_json(exclude_unset=True)))
         return
+    answer = printable_answer(answer)
     console = Console(markup=False, highlight=False, emoji=False)
     if not console.is_terminal:
         # The output goes to a file or a program, so rich must not cut or wrap the table.
@@ -400,7 +407,8 @@ def where(
     fields |= general.conventions | _named(top_k=top_k, unknown_labels=unknown_labels)
     if places:
         fields["searched"] = [*fields.get("searched", ()), *places]
-    _show(context, lambda client: client.where(label, **fields), tables.where)
+    shown = partial(tables.where, rooms=fields["rooms"])
+    _show(context, lambda client: client.where(label, **fields), shown)
 
 
 # ------------------------------------------------------------------------------------- models
@@ -429,7 +437,10 @@ def ready(context: typer.Context) -> None:
 # ------------------------------------------------------------------------------------ planners
 
 
-@app.command()
+@app.command(
+    epilog="General options, before or after mcp: --url ADDRESS, --model NAME (default: the "
+    "service's default), --offline STORE, --timeout SECONDS. See also scene --help."
+)
 def mcp(
     context: typer.Context,
     http: Annotated[
@@ -493,9 +504,9 @@ def _scene(
         _fail(f"{files[0]} has no object for a request: {scene.notes[0].detail}")
     for note in scene.notes[:_MAX_NOTES]:
         which = "" if note.detection is None else f"detection {note.detection}: "
-        print(f"{files[0]}: {which}{note.detail}", file=sys.stderr)
+        print(printable(f"{files[0]}: {which}{note.detail}"), file=sys.stderr)
     if (more := len(scene.notes) - _MAX_NOTES) > 0:
-        print(f"{files[0]}: {more} more notes of this kind", file=sys.stderr)
+        print(printable(f"{files[0]}: {more} more notes of this kind"), file=sys.stderr)
     read = partial(_read, "--relations", read=phrases.relation)
     relations = [read(text) for text in stated] if stated else None
     general: Options = context.obj
@@ -543,6 +554,6 @@ def _exit_on_error() -> Iterator[None]:
 
 def _fail(message: str, status: int = MEANINGLESS) -> NoReturn:
     Console(stderr=True, markup=False, highlight=False, emoji=False, soft_wrap=True).print(
-        message, style="red"
+        printable_lines(message), style="red"
     )
     raise typer.Exit(status)

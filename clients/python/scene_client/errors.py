@@ -15,10 +15,14 @@ from pydantic import ValidationError
 from typing_extensions import Self
 
 from scene_client.schemas import FieldError, Problem
+from scene_client.untrusted import printable, printable_lines
 
 
 class ClientError(Exception):
-    """Base class of the exceptions. A call of the client failed."""
+    """Base class of the exceptions. A call of the client failed. The text suits a terminal."""
+
+    def __str__(self) -> str:
+        return printable_lines(super().__str__())
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Process pools pickle exceptions. Pickle must not call the constructors of subclasses.
@@ -90,7 +94,7 @@ class ProblemError(ClientError):
         lines += [f"{error.pointer}: {_message(error)}" for error in errors[:MOST_SHOWN]]
         if len(errors) > MOST_SHOWN:
             lines.append(f"and {len(errors) - MOST_SHOWN} more errors")
-        super().__init__("\n  ".join(lines))
+        super().__init__("\n  ".join(map(printable, lines)))
         self.type = type
         self.status = status
         self.title = title
@@ -119,6 +123,10 @@ class DeadlineError(ClientError):
 
 class AnswerError(ClientError):
     """The client cannot read the answer of the service."""
+
+
+class UnknownThingError(ClientError, LookupError):
+    """A home has no thing with this id, for example because the thing is gone."""
 
 
 class HomeFileError(ClientError, ValueError):

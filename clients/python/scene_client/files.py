@@ -16,6 +16,7 @@ from scene_client.home_state import FORMAT, state_of
 from scene_client.parsing import Parts, data_of, json_value, parsed, text_of
 from scene_client.ros_fields import WELL_KNOWN, LabelMap, MessageError, read_label_map
 from scene_client.sightings import SceneFields
+from scene_client.untrusted import read_regular
 
 MAX_FILE: Final = 64 * 2**20
 """Maximum size of a scene file in bytes. The service has the same upper limit for a body."""
@@ -247,14 +248,12 @@ def _names_in(data: Any, depth: int = _DEEPEST) -> Any:
 
 def _bytes(name: str) -> bytes:
     try:
-        if name == "-":
-            text = sys.stdin.buffer.read(MAX_FILE + 1)
-        else:
-            with Path(name).expanduser().open("rb") as file:
-                text = file.read(MAX_FILE + 1)
+        if name != "-":
+            return read_regular(Path(name).expanduser(), MAX_FILE)
+        content = sys.stdin.buffer.read(MAX_FILE + 1)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise MessageError(f"{name}: {str(reason).lower()}") from None
-    if len(text) > MAX_FILE:
-        raise MessageError(f"{name} is too large: it has more than {MAX_FILE} bytes")
-    return text
+    if len(content) > MAX_FILE:
+        raise MessageError(f"{name}: it is too large: it has more than {MAX_FILE} bytes")
+    return content

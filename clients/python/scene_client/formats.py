@@ -28,6 +28,7 @@ from scene_client.records import (
     names_scene,
     read,
     records_of,
+    require_records,
 )
 from scene_client.ros_fields import REMEDY, LabelMap, MessageError, read_label_map, short, unwrapped
 from scene_client.schemas import Detection
@@ -66,6 +67,8 @@ def scenes_in(data: Any, label_map: LabelMap | None = None) -> dict[str, Reader]
         MessageError: the data has an unknown format, or contains no objects.
     """
     data = unwrapped(data)
+    if isinstance(data, list | dict):
+        require_records(len(data))
     form = data.form if isinstance(data, Rows) else None
     if form in (None, RECORDS):
         form = form_of(data)

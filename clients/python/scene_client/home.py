@@ -13,40 +13,30 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from scene_client import schemas
-from scene_client.errors import ClientError, InvalidRequestError, ProblemError
+from scene_client.errors import ClientError, InvalidRequestError, ProblemError, UnknownThingError
+from scene_client.floor_plan import FloorPlan, pose_of
 from scene_client.home_settings import Latch, Settings
 from scene_client.home_state import (
     MOST_THINGS,
     UNKNOWN,
+    Asked,
     Event,
     Kind,
     Room,
     State,
-    inside,
-    pose_of,
     read_state,
     seconds_of,
     write_state,
 )
 from scene_client.recorder import Recorder
-from scene_client.tracks import (
-    Frame,
-    Point,
-    Track,
-    Tracks,
-    Vector,
-    minus,
-    plus,
-    read_detections,
-)
+from scene_client.tracks import Frame, Point, Track, Tracks, Vector, minus, plus, read_detections
 
 if TYPE_CHECKING:
     from scene_client.sync import Client
 
-EDGE: Final = 0.2  # metres outside of a room until a thing, or the robot, has left it
 NEAR: Final = 5.0  # metres around the robot; without rooms, the things within are its room
 LIKELY: Final = 0.2  # probability of existence from which a thing is evidence for the room type
-MARGIN: Final = 0.1  # difference of probabilities from which another room type is likelier
+MARGIN: Final = 0.1  # difference from which another room type, or another label, is likelier
 LOST_TIMEOUT: Final = 0.3  # seconds of a try while the service is lost
 FIRST_PAUSE, LONGEST_PAUSE = 2.0, 30.0  # seconds between tries; the pause doubles each time
 
@@ -68,6 +58,7 @@ class Home(AbstractContextManager["Home"]):
 
     Raises:
         HomeFileError: the file is damaged, or of a newer version.
+        InvalidRequestError: a polygon has fewer than three corners.
     """
 
     def __init__(
@@ -86,13 +77,13 @@ class Home(AbstractContextManager["Home"]):
         self.room = ""  # of the robot
         self.matched: list[str] = []  # track of each detection of the last frame
         self.confirmed: set[tuple[str, str]] = set()  # habits: label and room
-        self._polygons, self._candidates = dict(rooms or {}), list(room_candidates)
+        self._plan, self._candidates = FloorPlan(rooms or {}), list(room_candidates)
         self._recorder = None if record is None else Recorder(record)
-        self._rooms = {name: Room() for name in self._polygons}
+        self._rooms = {name: Room() for name in self._plan.rooms}
         self._tracks = Tracks(self.settings, self._room_of)
         self._pose: Vector | None = None
         self._now = self._saved = self._next = -math.inf
-        self._asked: dict[str, dict[str, tuple[str, float, Vector | None]]] = {}
+        self._asked = Asked(self.settings.step)
         self._lost: float | None = None  # seconds until the next try
         if self.path is not None:
             self._resume(read_state(self.path))
@@ -113,17 +104,19 @@ class Home(AbstractContextManager["Home"]):
 
         Positions and the `pose` (x, y, yaw) are in the frame ``map``. `stamp` is in seconds; the
         default is the clock of the computer. `room` is the robot's room; the default is the polygon
-        with the robot. `view` replaces that of the home. Invalid detections raise an
-        `InvalidRequestError`.
+        with the robot. `view` replaces that of the home.
+
+        Raises:
+            InvalidRequestError: a detection or the pose is invalid.
         """
-        seen = read_detections(detections)
+        seen, at = read_detections(detections), pose_of(pose)
         if (now := seconds_of(stamp)) < self._now:  # a recording starts again
             self._saved = self._next = now
             self._now = now - 1.0
         elapsed, self._now = now - self._now, now
         self._tracks.follow_jump(seen)
-        self._pose = None if (at := pose_of(pose)) is None else minus(at, self._tracks.shift)
-        if room is None and self._pose is not None and self._polygons:
+        self._pose = None if at is None else minus(at, self._tracks.shift)
+        if room is None and self._pose is not None and self._plan.rooms:
             room = self._room_of(self._pose, self.room) or self.room
         self.room = room or ""
         weight = min(1.0, elapsed / self.settings.look)
@@ -133,7 +126,7 @@ class Home(AbstractContextManager["Home"]):
         self.matched = [one.id for one in tracks]
         events = [self._event("appeared", one, one.first) for one in appeared]
         events += [self._event("gone", one, one.last) for one in gone]
-        events += self._ask()
+        events += [*self._relabelled(tracks), *self._ask()]
         if self._lost is None:
             events += [*self._alarms(tracks), *self._settle(elapsed)]
         if self.path is not None and now - self._saved >= self.settings.save_every:
@@ -141,14 +134,16 @@ class Home(AbstractContextManager["Home"]):
         return events
 
     def _room_of(self, place: Vector, room: str) -> str:
-        """Return the room of a place. At its edges, a thing or a robot stays in its `room`."""
-        (x, y, _), polygon = place, self._polygons.get(room, ())
-        around = ((x, y), (x - EDGE, y), (x + EDGE, y), (x, y - EDGE), (x, y + EDGE))
-        if not self._polygons:
-            return self.room
-        if any(inside(*at, polygon) for at in around):
-            return room
-        return next((one for one, edge in self._polygons.items() if inside(x, y, edge)), "")
+        return self._plan.room_of(place, room) if self._plan.rooms else self.room
+
+    def _relabelled(self, seen: Iterable[Track]) -> Iterator[Event]:
+        """Report the things whose votes are clearly for another label than in the last event."""
+        for track in (one for one in seen if one.is_confirmed):
+            former = track.named or track.label
+            if track.share(track.label) - track.share(former) > MARGIN:
+                yield self._event("relabelled", track, self._now, former)
+                former = track.label
+            track.named = former
 
     def _alarms(self, seen: Iterable[Track]) -> Iterator[Event]:
         """Count the verdicts about the seen things. Alarms of unseen things stay as they are."""
@@ -190,7 +185,7 @@ class Home(AbstractContextManager["Home"]):
         if self._now < self._next:
             return
         things, room = self._things(self.room), self._rooms[self.room]
-        is_new = self._lost is not None or self._has_changed(things)
+        is_new = self._lost is not None or self._asked.differs(self.room, things)
         is_open = room.is_named is not True and (is_new or room.type.value is None)
         timeout = self.settings.timeout if self._lost is None else LOST_TIMEOUT
         try:
@@ -202,7 +197,7 @@ class Home(AbstractContextManager["Home"]):
             raise
         except ClientError as error:
             if isinstance(error, ProblemError) and error.status == HTTPStatus.UNPROCESSABLE_ENTITY:
-                self._remember(things)  # the service knows none of the labels
+                self._asked.remember(self.room, things)  # the service knows none of the labels
                 self._next = self._now + FIRST_PAUSE
                 return
             if self._lost is None:
@@ -214,23 +209,6 @@ class Home(AbstractContextManager["Home"]):
             self._lost = None
             yield Event("service", self._now, self._now, label="back")
         self._next = self._now + self.settings.pause
-
-    def _has_changed(self, things: list[Track]) -> bool:
-        step, asked = self.settings.step, self._asked.get(self.room, {})
-        if asked.keys() != {one.id for one in things}:
-            return True
-        for one in things:
-            label, confidence, place = asked[one.id]
-            has_moved = place and one.place and math.dist(place, one.place) > step
-            if label != one.label or abs(confidence - one.confidence) > step or has_moved:
-                return True
-        return False
-
-    def _remember(self, things: list[Track]) -> None:
-        """Remember what a question was about. The verdicts of its answer follow."""
-        self._asked[self.room] = {one.id: (one.label, one.confidence, one.place) for one in things}
-        for one in things:
-            one.verdict = None
 
     def _ask_type(self, room: Room, things: list[Track], timeout: float) -> None:
         objects = [one.as_object(self._tracks.shift) for one in things]
@@ -250,7 +228,7 @@ class Home(AbstractContextManager["Home"]):
         if "room_type" in scene and room.is_named is None:
             guessed = [one.label for one in answer.mapped if one.similarity < 1]
             room.is_named = self.room not in (*answer.ignored, *guessed)
-        self._remember(things)
+        self._asked.remember(self.room, things)
         moved = {one.moved or one.subject: one for one in answer.misplaced if one.is_misplaced}
         for one in answer.outliers:
             if (track := self._tracks.all.get(one.object)) is None:
@@ -318,6 +296,19 @@ class Home(AbstractContextManager["Home"]):
         ]
         return sorted(found, key=lambda one: -one.confidence)[:MOST_THINGS]
 
+    def thing(self, track_id: str) -> dict[str, Any]:
+        """Return a thing as an object of a request, with its position in the frame ``map``.
+
+        Raises:
+            UnknownThingError: the home has no such thing.
+        """
+        return self._track(track_id).as_object(self._tracks.shift)
+
+    def _track(self, track_id: str) -> Track:
+        if (track := self._tracks.all.get(track_id)) is None:
+            raise UnknownThingError(f"the home has no thing {track_id!r}, or it is gone")
+        return track
+
     def missing(self, room: str | None = None, **fields: Any) -> schemas.MissingAnswer:
         """Ask which things a room lacks. Other fields are those of `Client.missing`."""
         scene = {**self.scene(room), "coverage": self.coverage(room)}
@@ -335,18 +326,21 @@ class Home(AbstractContextManager["Home"]):
     def confirm(self, track_id: str) -> list[Event]:
         """State that a thing belongs where it is. Return the alarms that this clears.
 
-        Things of this label in this room raise no alarm from now on. With ``record``, the scene of
-        the room is recorded as confirmed, without the things of other alarms.
+        Things of this label in this room raise no alarm from now on. The file of the home is
+        written at once. With ``record``, the scene of the room is recorded as confirmed, without
+        the things of other alarms.
 
         Raises:
-            KeyError: the home has no such thing.
+            UnknownThingError: the home has no such thing.
         """
-        track, events = self._tracks.all[track_id], []
+        track, events = self._track(track_id), list[Event]()
         self.confirmed.add((track.label, track.room))
         for one in self._tracks.all.values():
             if self._is_habit(one) and one.alarm.value is not None:
                 former, one.alarm = one.alarm.value, Latch()
                 events.append(self._event("cleared", one, self._now, former))
+        if self.path is not None:
+            self._try_save()  # the robot may stop before its next frame
         if self._recorder is not None:
             quiet = [one for one in self._things(track.room) if one.alarm.value is None]
             kind = self._rooms.get(track.room, Room()).settled_type(track.room)
@@ -378,7 +372,8 @@ class Home(AbstractContextManager["Home"]):
         self._tracks.shift, self._tracks.count = state.shift, state.count
         self._rooms |= state.rooms
         for track in state.tracks.values():
-            if self._polygons and track.place is not None and track.room not in self._polygons:
+            is_renamed = track.room not in self._plan.rooms  # if there are any
+            if self._plan.rooms and track.place is not None and is_renamed:
                 track.room = self._room_of(track.place, "")  # its room has another name now
             self._tracks.add(track)
         self._now = self._saved = -math.inf if state.stamp is None else state.stamp

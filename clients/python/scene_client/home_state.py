@@ -2,31 +2,37 @@
 
 from __future__ import annotations
 
-import json
+import errno
 import math
 import os
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
 
 from pydantic import TypeAdapter
+from pydantic_core import from_json
 
 from scene_client import schemas
 from scene_client.errors import HomeFileError
 from scene_client.home_settings import Latch
-from scene_client.tracks import Point, Track, Vector
+from scene_client.tracks import Place, Track, Vector
+from scene_client.untrusted import printable, read_regular
 
 FORMAT: Final = "scene-home"
 VERSION: Final = 1  # of the file
 UNKNOWN: Final = "nearest-or-ignore"  # treatment of unknown labels
 MOST_THINGS, MOST_ROOMS = 256, schemas.MAX_ROOMS  # of a room in a request, and of a home
+MOST_BYTES: Final = 2**23  # of the file; 10,000 things have 5 MB
+_MOST: Final = 1e12  # absolute value of a number in the file; times have 2e9
+_LONGEST: Final = 256  # characters of a text in the file
 HEADINGS, LOOKS = 8, 30  # directions, or looks without poses, that show a whole room
 
 Kind = Literal[
-    "appeared", "gone", "out-of-place", "misplaced", "misdetection", "cleared", "room", "service"
-]
+    "appeared", "gone", "relabelled", "out-of-place", "misplaced", "misdetection", "cleared",
+    "room", "service",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -40,7 +46,7 @@ class Event:
     label: str | None = None  # of the thing; type of the room; service `lost` or `back`
     room: str = ""  # name of the room; empty without names
     probability: float | None = None  # in the last answer
-    detail: str | None = None  # the former alarm or type; the error of the service
+    detail: str | None = None  # the former alarm, label or type; the error of the service
 
 
 @dataclass
@@ -71,12 +77,31 @@ class Room:
         return name if self.is_named else self.type.value
 
 
-def pose_of(values: Sequence[float] | Mapping[str, float] | None) -> Vector | None:
-    """Return x, y and yaw; None if the robot is not located."""
-    if values is None:
-        return None
-    x, y, yaw = [values[n] for n in ("x", "y", "yaw")] if isinstance(values, Mapping) else values
-    return (float(x), float(y), float(yaw)) if all(map(math.isfinite, (x, y, yaw))) else None
+class Asked:
+    """What the last question about each room was about. `step` is the least change of a thing."""
+
+    def __init__(self, step: float) -> None:
+        self.step = step
+        self._things: dict[str, dict[str, tuple[str, float, Vector | None]]] = {}
+
+    def differs(self, room: str, things: Sequence[Track]) -> bool:
+        """Return whether the things of a room have changed since the last question."""
+        asked = self._things.get(room, {})
+        if asked.keys() != {one.id for one in things}:
+            return True
+        for one in things:
+            label, confidence, place = asked[one.id]
+            has_moved = place and one.place and math.dist(place, one.place) > self.step
+            if label != one.label or abs(confidence - one.confidence) > self.step or has_moved:
+                return True
+        return False
+
+    def remember(self, room: str, things: Iterable[Track]) -> None:
+        """Remember what a question is about. The verdicts of its answer follow."""
+        self._things[room] = {}
+        for one in things:
+            self._things[room][one.id] = (one.label, one.confidence, one.place)
+            one.verdict = None
 
 
 def seconds_of(stamp: float | schemas.Stamp | schemas.Body | None) -> float:
@@ -89,22 +114,13 @@ def seconds_of(stamp: float | schemas.Stamp | schemas.Body | None) -> float:
     return whole.sec + whole.nanosec * 1e-9
 
 
-def inside(x: float, y: float, polygon: Iterable[Point]) -> bool:
-    """Return whether a polygon contains a point (even-odd rule)."""
-    corners, odd = list(polygon), False
-    for (ax, ay), (bx, by) in zip(corners, corners[1:] + corners[:1], strict=True):
-        if (ay > y) != (by > y) and x < ax + (y - ay) * (bx - ax) / (by - ay):
-            odd = not odd
-    return odd
-
-
 @dataclass
 class State:
     """The contents of the file of a home."""
 
     stamp: float | None = None  # time of the last frame
     room: str = ""  # room of the robot
-    shift: Vector = (0.0, 0.0, 0.0)  # of the map
+    shift: Place = (0.0, 0.0, 0.0)  # of the map
     count: int = 0  # number of all tracks, also of ended ones
     habits: set[tuple[str, str]] = field(default_factory=set)  # label and room
     rooms: dict[str, Room] = field(default_factory=dict)
@@ -136,16 +152,21 @@ class State:
         return fields
 
 
+_FILE: Final = TypeAdapter(State)
+
+
 def write_state(state: State, path: Path) -> None:
     """Replace the file of a home. A reader, or a crash, never sees a part of it.
 
     Raises:
-        OSError: the file cannot be written.
+        OSError: the file cannot be written, or would be larger than `read_state` accepts.
     """
-    sibling = path.with_name(f".{path.name}.{os.getpid()}")
+    sibling, content = path.with_name(f".{path.name}.{os.getpid()}"), _FILE.dump_json(state)
+    if len(content) > MOST_BYTES:
+        raise OSError(errno.EFBIG, f"the home has more than {MOST_BYTES} bytes")
     try:
         with sibling.open("wb") as file:
-            file.write(TypeAdapter(State).dump_json(state))
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         sibling.replace(path)
@@ -160,7 +181,7 @@ def read_state(path: Path) -> State:
         HomeFileError: the file is damaged, or of a newer version.
     """
     try:
-        return state_of(json.loads(path.read_bytes()), path)
+        return state_of(from_json(read_regular(path, MOST_BYTES)), path)
     except FileNotFoundError:
         return State()
     except (OSError, ValueError) as error:
@@ -178,13 +199,28 @@ def state_of(data: Any, path: str | os.PathLike[str]) -> State:
     try:
         version = data["version"]
         if version <= VERSION:
-            return TypeAdapter(State).validate_python(data)
+            _require_plain(data)
+            return _FILE.validate_python(data)
     except (LookupError, TypeError, ValueError) as error:
         raise _damaged(path, error) from None
     raise HomeFileError(
         f"{path} has version {version}, but this client reads up to version {VERSION}. Install a "
         "newer client, or name another file. It is left as it is."
     )
+
+
+def _require_plain(data: Any) -> None:
+    """Raise ValueError for a number or a text that no home has, and that would stop the robot."""
+    nodes = [data]
+    for node in nodes:
+        if isinstance(node, dict):
+            nodes += [*node, *node.values()]
+        elif isinstance(node, list):
+            nodes += node
+        elif isinstance(node, str) and not (node.isprintable() and len(node) <= _LONGEST):
+            raise ValueError(f"the text {printable(node[:40])} is not plain")
+        elif isinstance(node, int | float) and not abs(node) <= _MOST:
+            raise ValueError("a number is not finite, or out of range")
 
 
 def _damaged(path: str | os.PathLike[str], error: Exception) -> HomeFileError:

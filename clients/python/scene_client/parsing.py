@@ -18,12 +18,27 @@ from typing import Any, Final
 from xml.etree import ElementTree
 
 from scene_client.boxes import NUMBER
-from scene_client.records import FIELDS, TABLE, Form, Rows, key_of, pattern
+from scene_client.records import (
+    FIELDS,
+    TABLE,
+    Form,
+    Rows,
+    key_of,
+    pattern,
+    require_records,
+)
 from scene_client.ros_fields import MessageError
 
 _MOST_YAML: Final = 2**19  # bytes; PyYAML is slow
 MOST_MESSAGES: Final = 2**26
 """Maximum size of the chunks of a recording after decompression in bytes."""
+
+MAX_VALUES: Final = 4_000_000
+"""Maximum number of values in a text. Each takes up to 100 bytes of memory, in place of two."""
+_IN_JSON, _IN_XML = ",[{", "<="  # the marks of the values
+_IN_LINES: Final = ",;\t| \n\r\v\f\x1c\x1d\x1e\x85\u2028\u2029"
+MOST_MESSAGE: Final = 2**20
+"""Maximum size of a message in bytes. An array of tiny messages takes 250 times its size."""
 
 _PART: Final = 2**16  # characters of XML
 _START: Final = 2000  # characters in which a refused format shows
@@ -91,6 +106,7 @@ def _refuse(start: str) -> None:
 def data_of(text: str) -> Any:
     """Return the data of a text, as `parsed` does."""
     text = text.removeprefix("\ufeff")
+    require_few(text, "`", 8)
     if len(blocks := _FENCE.findall(text)) > 1:  # of a language model
         return Parts({str(n): partial(data_of, block) for n, block in enumerate(blocks, 1)})
     text = blocks[0] if blocks else text
@@ -99,11 +115,13 @@ def data_of(text: str) -> Any:
         return _xml(text)
     if start in ("{", "["):
         return _json(text)
+    require_few(text, _IN_LINES)
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     lines = [one for one in lines if not _COMMENT.match(one) and one != "???"]
     lines = lines[1:] if lines and lines[0].startswith("sep=") else lines  # of Excel
     if not lines:
         raise MessageError("the file is empty")
+    require_records(len(lines))
     if items := _ITEMS.findall(text):  # a label map of TensorFlow
         return {_member(item, "id"): _member(item, "display_name", "name") for item in items}
     for parse in (_table, _numbers, _lines, _labels):
@@ -114,12 +132,23 @@ def data_of(text: str) -> Any:
     raise MessageError(_what_text(lines))
 
 
+def require_few(text: str, marks: str, share: int = 1) -> None:
+    """Raise `MessageError` for more than `MAX_VALUES` / share values, before they take memory.
+
+    ``marks`` are the characters between values.
+    """
+    most = MAX_VALUES // share
+    if sum(map(text.count, marks)) > most:
+        raise MessageError(f"it has more than {most} values: cut out the scenes that you need")
+
+
 def _member(item: str, *names: str) -> str:
     found = (_MEMBERS[name].search(item) for name in names)
     return next((part for one in found if one for part in one.groups() if part), "")
 
 
 def _json(text: str) -> Any:
+    require_few(text, _IN_JSON)
     first, _, rest = text.strip().partition("\n")
     if rest.strip() and first.rstrip().endswith(("}", "]")):
         try:
@@ -127,6 +156,7 @@ def _json(text: str) -> Any:
         except (ValueError, RecursionError):
             pass
         else:
+            require_records(text.count("\n"))
             lines = enumerate(text.split("\n"), 1)
             return Parts({str(n): partial(json_value, one, n) for n, one in lines if one.strip()})
     return json_value(text)
@@ -136,8 +166,9 @@ def json_value(text: str, line: int = 1) -> Any:
     """Return the value of a text in JSON. ``line`` is the number of its first line.
 
     Raises:
-        MessageError: the text is not JSON.
+        MessageError: the text is not JSON, or has more than `MAX_VALUES` values.
     """
+    require_few(text, _IN_JSON)
     try:
         return json.loads(text)
     except RecursionError:
@@ -373,6 +404,7 @@ def _typed(value: Any) -> Any:
 def _xml(text: str) -> Any:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise MessageError("this is XML with a document type, which this program does not read")
+    require_few(text, _IN_XML, 4)
     try:
         # Expat bounds the expansion of entities, and a document type is refused above. Between two
         # parts of the text, other threads run.
@@ -424,8 +456,9 @@ def _messages(content: bytes) -> Parts:
                 elif isinstance(record, kinds.Message):
                     channel = channels[record.channel_id]
                     schema, coding = schemas.get(channel.schema_id), channel.message_encoding
-                    decode = json.loads if coding == "json" else factory.decoder_for(coding, schema)
+                    decode = _json_of if coding == "json" else factory.decoder_for(coding, schema)
                     if decode is not None:
+                        require_records(len(parts) + 1)
                         counts[channel.topic] += 1
                         name = f"{channel.topic}:{counts[channel.topic]}"
                         parts[name] = partial(_decoded, decode, record.data)
@@ -436,9 +469,17 @@ def _messages(content: bytes) -> Parts:
     return parts
 
 
+def _json_of(data: bytes) -> Any:
+    return json_value(text_of(data))
+
+
 def _decoded(decode: Callable[[bytes], Any], data: bytes) -> Any:
+    if len(data) > MOST_MESSAGE:
+        raise MessageError(f"this message has more than {MOST_MESSAGE} bytes")
     try:
         return decode(data)
+    except MessageError:
+        raise
     except Exception:  # noqa: BLE001 — of any of three libraries
         raise MessageError("this message does not fit its schema") from None
 

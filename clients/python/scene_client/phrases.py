@@ -5,13 +5,14 @@ Each function raises a `PydanticCustomError`, which is a `ValueError`, for a tex
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from typing import Any, Final, get_args
 
+from pydantic import TypeAdapter
 from pydantic_core import PydanticCustomError
 
-from scene_client.schemas import RelationName
+from scene_client.schemas import Detection, HomeRoom, RelationName, Spot
 
 RELATIONS: Final[tuple[RelationName, ...]] = get_args(RelationName)
 
@@ -98,6 +99,33 @@ def search(text: str) -> dict[str, Any]:
         return searched | {"seen_share": float(share or 1)}
     except ValueError:
         raise _error(f"must be ROOM, ROOM:OBJECT or ROOM:OBJECT:SHARE, and not {text}") from None
+
+
+Labels = Mapping[tuple[str, str], str]
+"""The labels of the objects of a home, by room and id."""
+
+
+def labels_in(rooms: Iterable[Any]) -> Labels:
+    """Return the labels of the objects with ids, from the `rooms` of a `where` request.
+
+    Raises:
+        ValidationError: the rooms are invalid.
+    """
+    found = TypeAdapter(list[HomeRoom]).validate_python(rooms)
+    return {
+        (room.id, one.id): one.label
+        for room in found
+        for one in room.objects
+        if isinstance(one, Detection) and one.id is not None
+    }
+
+
+def spot(place: Spot, labels: Labels) -> str:
+    """Return a place at an object in words, such as "on top of sink (t12)"."""
+    name = place.object or ""
+    label = labels.get((place.room, name), name)
+    words = name if label in name else f"{label} ({name})"
+    return words if place.relation is None else f"{PREPOSITIONS[place.relation]} {words}"
 
 
 def _error(message: str) -> PydanticCustomError:

@@ -7,23 +7,32 @@ The MCP server (`mcp_server`) lists the same tools. docs/planners.md describes t
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, ClassVar, Final, Literal
+from typing import Annotated, Any, ClassVar, Final, Literal, TypeVar
 
 from pydantic import BeforeValidator, Field, WithJsonSchema
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
-from pydantic_core import core_schema
+from pydantic_core import PydanticCustomError, core_schema
 
 from scene_client import phrases, sentences
 from scene_client.calls import validated
 from scene_client.errors import ClientError, InvalidRequestError
-from scene_client.schemas import Relation, Request
+from scene_client.schemas import MAX_LABEL, Answer, Relation, Request
 from scene_client.schemas.missing import Anchor
 from scene_client.schemas.requests import Detection, Label, SceneObject, SomeObjects
 from scene_client.schemas.where import Searched
 from scene_client.sync import Client
+from scene_client.untrusted import printable, printable_answer, shortened
+
+AnswerT = TypeVar("AnswerT", bound=Answer)
 
 Vendor = Literal["openai", "anthropic", "langchain"]
 
+MOST_TEXT: Final = 10_000
+"""Maximum length of an answer or an error in characters, for the context of the language model."""
+MOST_ENTRIES: Final = 256
+"""Maximum number of entries in each list of the arguments."""
+_LONGEST_NAME: Final = 300  # characters of a text in an answer of the service
+_LONGEST_PHRASE: Final = 3 * MAX_LABEL
 _SAMPLES: Final = 20  # rooms from which `imagine_room` counts
 
 
@@ -61,23 +70,34 @@ _HOME: Final = {"type": "object", "additionalProperties": _TEXTS}
 
 def _as_relation(value: Any) -> Any:
     """Return the fields of a relation; a text of a place that the service does not use stays."""
-    is_used = isinstance(value, str) and not phrases.is_unused(value)
+    is_used = isinstance(value, str) and not phrases.is_unused(_short(value))
     return phrases.relation(value) if is_used else value
 
 
 def _spoken(read: Callable[[str], dict[str, Any]]) -> BeforeValidator:
-    return BeforeValidator(lambda value: read(value) if isinstance(value, str) else value)
+    return BeforeValidator(lambda value: read(_short(value)) if isinstance(value, str) else value)
+
+
+def _short(phrase: str) -> str:
+    """Return a phrase. A longer one than two labels and a relation is refused unread."""
+    if len(phrase) > _LONGEST_PHRASE:
+        rule = f"must have at most {_LONGEST_PHRASE} characters"
+        raise PydanticCustomError("phrase", "{rule}", {"rule": rule})
+    return phrase
 
 
 Objects = Annotated[SomeObjects, WithJsonSchema(_OBJECTS)]
-Labels = Annotated[list[Label], WithJsonSchema(_TEXTS)]
+_Few = Field(max_length=MOST_ENTRIES)
+Labels = Annotated[list[Label], _Few, WithJsonSchema(_TEXTS)]
 Stated = Annotated[Relation | Label, BeforeValidator(_as_relation)]
-Relations = Annotated[list[Stated], WithJsonSchema(_TEXTS)]
+Relations = Annotated[list[Stated], _Few, WithJsonSchema(_TEXTS)]
 Place = Annotated[Anchor, _spoken(phrases.place), WithJsonSchema({"type": "string"})]
 Home = Annotated[
-    dict[str, list[SceneObject]], Field(min_length=1, max_length=32), WithJsonSchema(_HOME)
+    dict[Label, Annotated[list[SceneObject], _Few]],
+    Field(min_length=1, max_length=32),
+    WithJsonSchema(_HOME),
 ]
-Places = Annotated[list[Annotated[Searched, _spoken(phrases.search)]], WithJsonSchema(_TEXTS)]
+Places = Annotated[list[Annotated[Searched, _spoken(phrases.search)]], _Few, WithJsonSchema(_TEXTS)]
 
 
 class _Schema(GenerateJsonSchema):
@@ -94,6 +114,11 @@ class _Schema(GenerateJsonSchema):
 
     def str_schema(self, schema: core_schema.StringSchema) -> JsonSchemaValue:
         return {"type": "string"}
+
+
+def _plain(answer: AnswerT) -> AnswerT:
+    """Return an answer whose names are short single lines: other texts could pose as a prompt."""
+    return printable_answer(answer, _LONGEST_NAME)
 
 
 class Tool(Request):
@@ -159,7 +184,7 @@ class FindOutOfPlace(_SceneTool):
 
     def answer(self, client: Client) -> str:
         """Return the objects that do not belong, and those in wrong places."""
-        found = client.outliers(**self.fields())
+        found = _plain(client.outliers(**self.fields()))
         return sentences.text(found, sentences.out_of_place(found), unused=self.unused())
 
 
@@ -179,7 +204,7 @@ class SuggestMissing(_SceneTool):
         fields = self.fields()
         if "only" in fields:
             fields["candidates"] = fields.pop("only")
-        found = client.missing(**fields, top_k=8)
+        found = _plain(client.missing(**fields, top_k=8))
         said = [*sentences.missing(found, only=self.only is not None)]
         labels = {one if isinstance(one, str) else one.label for one in self.objects}
         if listed := [name for name in self.only or () if name in labels]:
@@ -209,8 +234,9 @@ class LocateObject(Tool):
             {"id": name, "room_type": name, "objects": objects}
             for name, objects in fields["rooms"].items()
         ]
-        found = client.where(**fields)
-        return sentences.text(found, sentences.where(found), rooms=self.rooms)
+        found, labels = _plain(client.where(**fields)), phrases.labels_in(fields["rooms"])
+        said = sentences.where(found, labels, self.searched or ())
+        return sentences.text(found, said, rooms=self.rooms)
 
 
 class IdentifyRoom(Tool):
@@ -226,7 +252,7 @@ class IdentifyRoom(Tool):
 
     def answer(self, client: Client) -> str:
         """Return the likely room types."""
-        found = client.rooms(**self.fields())
+        found = _plain(client.rooms(**self.fields()))
         return sentences.text(found, sentences.rooms(found, self.objects))
 
 
@@ -238,7 +264,8 @@ class RelateObjects(_SceneTool):
 
     def answer(self, client: Client) -> str:
         """Return the likely relations, and those that are unusual."""
-        found = client.relations(**self.fields(), top_k=256, min_probability=sentences.MENTIONED)
+        fields = self.fields() | {"top_k": 256, "min_probability": sentences.MENTIONED}
+        found = _plain(client.relations(**fields))
         return sentences.text(found, sentences.relations(found), unused=self.unused())
 
 
@@ -261,7 +288,7 @@ class ImagineRoom(Tool):
         unused = self.objects or [] if self.room_type else []
         fields = {"objects": [], **self.fields()} | ({"objects": []} if unused else {})
         # The same arguments give the same answer, so a planner can rely on it.
-        found = client.generate(**fields, count=_SAMPLES, seed=0)
+        found = _plain(client.generate(**fields, count=_SAMPLES, seed=0))
         given = {*(self.objects or ()), *filter(None, [self.room_type])}
         return sentences.text(found, sentences.imagined(found, given), unused=unused)
 
@@ -319,7 +346,10 @@ def call(client: Client, name: str, arguments: Mapping[str, Any]) -> str:
     """
     try:
         if name not in TOOLS:
-            raise InvalidRequestError.about(f"no tool {name}; the tools are {', '.join(TOOLS)}")
-        return validated(TOOLS[name], dict(arguments)).answer(client)
+            problem = f"no tool {shortened(name, MAX_LABEL)}; the tools are {', '.join(TOOLS)}"
+            raise InvalidRequestError.about(problem)
+        answer = validated(TOOLS[name], dict(arguments)).answer(client)
+        return shortened(printable(answer), MOST_TEXT)
     except ClientError as error:
-        raise ToolError(sentences.failure(error)) from error
+        text = shortened(printable(sentences.failure(error)), MOST_TEXT)
+        raise ToolError(text) from error

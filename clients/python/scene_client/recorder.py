@@ -7,7 +7,6 @@ which scenes are written.
 from __future__ import annotations
 
 import errno
-import json
 import logging
 import os
 import stat
@@ -20,7 +19,7 @@ from pathlib import Path
 from time import monotonic, sleep
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from pydantic_core import to_json
+from pydantic_core import from_json, to_json
 
 from scene_client.errors import InvalidRequestError
 from scene_client.recorded_scene import ON_TOP, Thing, Time, Triple, likely, scene_of, time_of
@@ -74,7 +73,8 @@ class Recorder:
 
     `record` only decides which scenes are new. One thread of the recorder converts and writes them.
     If the file would become larger than `most_bytes`, it becomes the older file: ``scenes.jsonl``
-    is renamed to ``scenes.old.jsonl``, and an earlier older file is deleted. An error never reaches
+    is renamed to ``scenes.old.jsonl``, and an earlier older file is deleted. An unreadable end of
+    the file, such as a line of a crash, moves to ``scenes.jsonl.damaged``. An error never reaches
     the caller. The recorder logs one warning, and tries again with the next scene.
 
     Args:
@@ -91,6 +91,7 @@ class Recorder:
             message = "the name of a file with recorded scenes must end in .jsonl"
             raise InvalidRequestError.about(message)
         self.older = self.path.with_suffix(f".old{self.path.suffix}")
+        self.damaged = self.path.with_name(f"{self.path.name}.damaged")
         self.most_bytes = most_bytes
         # Hashes of the newest scenes, in order of use, with a hash of the places and the time of
         # the last comparison of places.
@@ -197,7 +198,7 @@ class Recorder:
             return
         for line in lines:
             try:
-                scene = json.loads(line)
+                scene = from_json(line)
                 room, relations = scene.get("room_type"), scene.get("relations") or ()
                 self._remember(_hashes(scene["group"], scene["objects"], room, relations), 0)
             except (AttributeError, LookupError, TypeError, ValueError):
@@ -207,7 +208,7 @@ class Recorder:
         """Write scenes until the file is full or an error occurs, and remove them from `scenes`."""
         try:
             with _locked(self.path) as file:
-                size = _mend(file)
+                size = self._mend(file)
                 while scenes:
                     _, line = scenes[0]
                     if len(line) > _LONGEST_LINE:
@@ -226,6 +227,26 @@ class Recorder:
             with self._lock:
                 for key in scenes.popleft()[0]:
                     self._recent.pop(key, None)
+
+    def _mend(self, file: int) -> int:
+        """End the last line, or set it aside if it is unreadable. Return the size of the file."""
+        size = os.lseek(file, 0, os.SEEK_END)
+        start = _start_of_tail(file, size)
+        if start == size:
+            return size
+        if _is_readable(file, start, size):
+            return size + os.write(file, b"\n")
+        is_full = self.damaged.is_file() and self.damaged.stat().st_size > self.most_bytes
+        flags = (_FLAGS & ~os.O_APPEND) | os.O_TRUNC if is_full else _FLAGS
+        with os.fdopen(os.open(self.damaged, flags, 0o600), "wb") as damaged:
+            for at in range(start, size, _TAIL):
+                os.lseek(file, at, os.SEEK_SET)
+                damaged.write(os.read(file, min(_TAIL, size - at)))
+            damaged.write(b"\n")
+        os.ftruncate(file, start)
+        message = "the last line of %s was unreadable: its %d bytes are in %s now"
+        _logger.warning(message, self.path, size - start, self.damaged.name)
+        return start
 
 
 # ---------------------------------------------------------------------------------- the file
@@ -262,25 +283,29 @@ def _lock(file: int, path: Path) -> bool:
         return False
 
 
-def _mend(file: int) -> int:
-    """End the last line, or cut it off if a crash left a part of a scene. Return the size."""
-    size = os.lseek(file, 0, os.SEEK_END)
-    start, tail = size, b""
-    while start and b"\n" not in tail and len(tail) < _LONGEST_LINE:
+def _start_of_tail(file: int, size: int) -> int:
+    """Return the position after the last line break."""
+    end = size
+    while end:
         # One byte is enough to see that the last line is complete.
-        step = min(start, _TAIL if tail else 1)
-        start = os.lseek(file, start - step, os.SEEK_SET)
-        tail = os.read(file, step) + tail
-    tail = tail.rpartition(b"\n")[2]
-    if not tail:
-        return size
+        start = max(0, end - (_TAIL if end < size else 1))
+        os.lseek(file, start, os.SEEK_SET)
+        if (found := os.read(file, end - start).rfind(b"\n")) >= 0:
+            return start + found + 1
+        end = start
+    return 0
+
+
+def _is_readable(file: int, start: int, size: int) -> bool:
+    """Return whether the last line is JSON that the training accepts."""
+    if size - start >= _LONGEST_LINE:
+        return False
+    os.lseek(file, start, os.SEEK_SET)
     try:
-        json.loads(tail)
-    except ValueError:
-        if tail.startswith(b"{"):
-            os.ftruncate(file, size - len(tail))
-            return size - len(tail)
-    return size + os.write(file, b"\n")
+        from_json(os.read(file, size - start))
+    except ValueError:  # also for nesting that is too deep
+        return False
+    return True
 
 
 def _write(file: int, size: int, line: bytes) -> None:

@@ -13,12 +13,13 @@ import re
 from collections.abc import Iterator, Mapping
 from functools import cached_property, lru_cache
 from importlib.resources import files
+from itertools import islice
 from typing import Any, Final
 
 from scene_client.boxes import IMAGE, NUMBER, SOLID, image, numeric, numerics, solid
 from scene_client.image_plane import Box
 from scene_client.paths import LOOKED_AT, Chain, each, get, leads
-from scene_client.ros_fields import frame_of, members, number, take, text, time_of
+from scene_client.ros_fields import MessageError, frame_of, members, number, take, text, time_of
 from scene_client.sightings import MAX_OBJECTS, Note, Reason, Seen, Sighting, Solid
 
 Form = dict[str, Any]
@@ -32,6 +33,9 @@ LABEL_MAP: Final[Form] = FORMATS[-1]
 """The format of a list of class names. Such a list describes a vocabulary instead of a scene."""
 FIELDS: Final[dict[str, Any]] = TABLE["fields"]
 """Usual names of each kind of field, in the form of `key_of`."""
+
+MAX_RECORDS: Final = 500_000
+"""Maximum number of lines, messages or objects of a file."""
 
 _SCENES: Final = [re.compile(pattern) for pattern in FIELDS["scene"]]  # places, frames, times
 _UNITS: Final[dict[str, float]] = FIELDS["units"]
@@ -48,6 +52,14 @@ class Rows(list[dict[str, Any]]):
     def __init__(self, rows: Any, form: Form = RECORDS, first: int = 1) -> None:
         super().__init__(rows)
         self.form, self.first = form, first
+
+
+def require_records(count: int) -> None:
+    """Raise `MessageError` for more than `MAX_RECORDS` lines, messages or objects."""
+    if count > MAX_RECORDS:
+        raise MessageError(
+            f"it has more than {MAX_RECORDS} lines or objects: cut out the scenes that you need"
+        )
 
 
 def matches(form: Form, data: Any) -> bool:
@@ -165,16 +177,18 @@ def records_of(form: Form, data: Any) -> dict[str, list[Record]]:
     """Return the records of each scene of data by the names of the scenes."""
     items = form.get("items", "[]")
     paths = [items] if isinstance(items, str) else items
-    records = [Record(chain) for path in paths for chain in each(data, path)]
+    chains = (chain for path in paths for chain in each(data, path))
+    records = _few(Record(chain) for chain in chains)
     if "inner" in form:
-        records = [
+        records = _few(
             Record((*one.chain, *inner[1:]))
             for one in records
             for inner in each(one.node, form["inner"])
-        ]
+        )
     for record in records:
         if "nested" in form:  # objects on other objects
             children = take(record.node, form["nested"]) or ()
+            require_records(len(records) + len(children))
             records += [Record((*record.chain, child)) for child in enumerate(children)]
     if "lacks" in form:
         records = [one for one in records if spot(one.chain, form["lacks"]) is not None]
@@ -184,6 +198,12 @@ def records_of(form: Form, data: Any) -> dict[str, list[Record]]:
     for name, record in zip(_scene_names(form, records), records, strict=True):
         scenes.setdefault(name, []).append(record)
     return scenes
+
+
+def _few(records: Iterator[Record]) -> list[Record]:
+    first = [*islice(records, MAX_RECORDS + 1)]
+    require_records(len(first))
+    return first
 
 
 def _scene_names(form: Form, records: list[Record]) -> list[str]:

@@ -15,9 +15,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from numbers import Real
 from typing import Any, Final, TypeAlias
 
+from scene_client.untrusted import printable
+
 
 class MessageError(ValueError):
-    """A message does not contain a valid scene, or an argument is invalid."""
+    """A message does not contain a valid scene, or an argument is invalid. The text is one line."""
+
+    def __str__(self) -> str:
+        return printable(super().__str__())
 
 
 def take(message: Any, *path: str) -> Any:

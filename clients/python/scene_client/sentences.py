@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from typing import Final, TypeAlias
 
+from scene_client import phrases
 from scene_client.errors import (
     ClientError,
     DeadlineError,
@@ -26,7 +27,7 @@ from scene_client.schemas import (
 )
 from scene_client.schemas.missing import MissingObject
 from scene_client.schemas.outliers import MisplacedRelation
-from scene_client.schemas.where import Spot
+from scene_client.schemas.where import Searched, Spot
 
 LIKELY: Final = 0.5
 """Minimum probability of a fact. An answer lists the others as possible."""
@@ -38,6 +39,7 @@ _DOUBTFUL: Final = 0.1  # minimum probability of a fault that is named without a
 _LIKELY_PLACE: Final = 0.25  # minimum probability of the place of a missing object
 _MOST_SPOTS: Final = 4  # maximum number of places in a room
 _LEAST_SPOT: Final = 0.01
+_SEEN: Final = 0.5  # seen share from which a place counts as searched
 
 Fact: TypeAlias = tuple[str, float, str]
 """A name, its probability and a further note, which may be empty."""
@@ -175,33 +177,54 @@ def _place(entry: MissingObject) -> str:
     return f"{words}, at its centre + [{x}, {y}, {z}] m"
 
 
-def where(answer: WhereAnswer) -> Iterator[str]:
-    """Say in which rooms and at which places the thing may be."""
-    thing = answer.listed_as or answer.label
+def where(
+    answer: WhereAnswer, labels: phrases.Labels, searched: Collection[Searched]
+) -> Iterator[str]:
+    """Say in which rooms and at which places the thing may be.
+
+    Args:
+        answer: the answer.
+        labels: labels of the objects with ids.
+        searched: places that were searched without success. A search can overlook the thing, so
+            they may still be likely, but a planner looks at the others first.
+    """
+    thing, kind = answer.listed_as or answer.label, answer.label if answer.listed_as else ""
+    spots = [spot for spot in answer.places if spot.probability >= _LEAST_SPOT and spot.object]
+    new = [spot for spot in spots if not _is_searched(spot, labels, searched)]
     rooms = []
     for room in answer.rooms:
-        spots = [spot for spot in answer.places if spot.room == room.room]
-        likely = [spot for spot in spots if spot.probability >= _LEAST_SPOT and spot.object]
-        kind = answer.label if answer.listed_as else ""
-        places = (f"{_spot(one, kind)} {_number(one.probability)}" for one in likely[:_MOST_SPOTS])
-        rooms.append((room.room, room.probability, ", ".join(places)))
+        likely = [spot for spot in spots if spot.room == room.room][:_MOST_SPOTS]
+        is_whole = any(one.room == room.room and one.object is None for one in _seen(searched))
+        notes = ["already searched"] * is_whole
+        notes += [
+            f"{_spot(one, kind, labels)} {_number(one.probability)}"
+            + " (already searched)" * (one not in new and not is_whole)
+            for one in likely
+        ]
+        rooms.append((room.room, room.probability, ", ".join(notes)))
     entries = [room for room in rooms if room[1] >= MENTIONED]
     yield from _split(entries, f"Probable place of {thing}", f"I am not sure about {thing}.")
-    best = max((one for one in answer.places if one.object), key=_likelihood, default=None)
+    best = max(new, key=lambda spot: spot.probability, default=None)
     if best is not None and entries and best.room != entries[0][0]:
-        yield f"Best single place: {_spot(best, '')} in {best.room} ({_number(best.probability)})."
+        place = f"{_spot(best, '', labels)} in {best.room} ({_number(best.probability)})"
+        yield f"Best {'unsearched' if searched else 'single'} place: {place}."
     yield f"In none of these rooms: {_number(answer.not_here)}."
 
 
-def _likelihood(spot: Spot) -> float:
-    return spot.probability
+def _seen(searched: Collection[Searched]) -> Iterator[Searched]:
+    return (one for one in searched if one.seen_share >= _SEEN)
 
 
-def _spot(spot: Spot, kind: str) -> str:
+def _is_searched(spot: Spot, labels: phrases.Labels, searched: Collection[Searched]) -> bool:
+    names = (None, spot.object, labels.get((spot.room, spot.object or "")))
+    return any(one.room == spot.room and one.object in names for one in _seen(searched))
+
+
+def _spot(spot: Spot, kind: str, labels: phrases.Labels) -> str:
     """Return a place in words. ``kind`` is the class of the thing, if it has another name."""
     if spot.is_listed or spot.relation is None:
         return f"already seen: {spot.object}{f', if you mean any {kind}' if kind else ''}"
-    return f"{PREPOSITIONS[spot.relation]} {spot.object}"
+    return phrases.spot(spot, labels)
 
 
 def rooms(answer: RoomsAnswer, objects: Collection[str]) -> Iterator[str]:

@@ -10,8 +10,7 @@ from rich import box
 from rich.console import Group, RenderableType
 from rich.table import Table
 
-from scene_client import schemas
-from scene_client.phrases import PREPOSITIONS
+from scene_client import phrases, schemas
 
 MOST_MISPLACED: Final = 10
 """Maximum number of table rows with probably false relations.
@@ -127,11 +126,17 @@ def rooms(answer: schemas.RoomsAnswer) -> RenderableType:
     return _table("room type", "listed as", "probability", "because", rows=rows)
 
 
-def where(answer: schemas.WhereAnswer) -> RenderableType:
-    """Return a table of the places of one thing, most probable first, and of its absence."""
+def where(answer: schemas.WhereAnswer, *, rooms: Iterable[object] = ()) -> RenderableType:
+    """Return a table of the places of one thing, most probable first, and of its absence.
+
+    Args:
+        answer: the answer.
+        rooms: rooms of the request, whose objects have labels.
+    """
+    labels = phrases.labels_in(rooms)
     likely = [entry for entry in answer.places if entry.probability >= POSSIBLE_PLACE]
     others = 1.0 - answer.not_here - sum(entry.probability for entry in likely)
-    rows = [(_place(entry), f"{entry.probability:.3f}") for entry in likely]
+    rows = [(_place(entry, labels), f"{entry.probability:.3f}") for entry in likely]
     if others >= POSSIBLE_PLACE:
         rows.append(("at another place", f"{others:.3f}"))
     rows.append(("not here", f"{answer.not_here:.3f}"))
@@ -254,13 +259,11 @@ def _relations(relations: Sequence[schemas.Relation], words: Mapping[str, str]) 
     return "\n".join(lines)
 
 
-def _place(spot: schemas.Spot) -> str:
+def _place(spot: schemas.Spot, labels: phrases.Labels) -> str:
     """Return a place in words, such as "bathroom: on top of sink_1"."""
     if spot.is_listed:
         return f"{spot.room}: seen there ({spot.object})"
-    if spot.relation is None:
-        return f"{spot.room}: elsewhere"
-    return f"{spot.room}: {PREPOSITIONS[spot.relation]} {spot.object}"
+    return f"{spot.room}: {phrases.spot(spot, labels) if spot.object else 'elsewhere'}"
 
 
 def _placement(placement: schemas.Placement) -> str:

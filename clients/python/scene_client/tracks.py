@@ -10,14 +10,23 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Final
+from typing import Annotated, Any, Final
+
+from pydantic import Field
 
 from scene_client import schemas
 from scene_client.calls import validated
 from scene_client.home_settings import Latch, Settings
+from scene_client.schemas.requests import Angle, Coordinate, Extent, Label, Name
 
 Vector = tuple[float, float, float]
 Point = tuple[float, float]
+
+# Types of values that a file may state.
+Place = tuple[Coordinate, Coordinate, Coordinate]
+Sides = tuple[Extent, Extent, Extent]
+Votes = Annotated[dict[Label, Annotated[float, Field(gt=0)]], Field(min_length=1)]
+LogOdds = Annotated[float, Field(ge=-100, le=100)]
 
 CELL: Final = 1.0  # width of a cell of the grid of tracks, and the largest gate
 MOST_CERTAIN: Final = 8.0  # largest log-odds of existence; a gone thing needs about 10 looks
@@ -25,7 +34,7 @@ MEMORY: Final = 20.0  # looks after which the mean of a position forgets older l
 UNCONFIRMED: Final = 60.0  # seconds without a detection after which an unconfirmed track ends
 FARTHEST_JUMP: Final = 2.5  # of the map
 SIMILAR: Final = 1.3  # largest ratio of the diagonals of two boxes of one thing with two labels
-NOTABLE: Final = 0.2  # share of the votes from which another label is an alternative
+NOTABLE: Final = 0.2  # least share of the votes of a label that is no error of the detector
 BESIDE: Final = math.radians(45)  # between a thing and its neighbours in a frame without a view
 # Probability that a frame shows a thing: in a known view, between others, in the same room.
 FULL, POSES, LABELS = 1.0, 0.6, 0.25
@@ -72,18 +81,19 @@ def _seen(one: schemas.Detection) -> Seen:
 class Track:
     """One thing, or a wrong detection as long as it is not confirmed."""
 
-    id: str
+    id: Name
     room: str
-    log_odds: float  # ln(p / (1 - p)) of the probability that the thing exists
+    log_odds: LogOdds  # ln(p / (1 - p)) of the probability that the thing exists
     first: float  # time of the first detection
     last: float  # time of the last detection
-    votes: dict[str, float] = field(default_factory=dict)  # sum of confidences by label
-    place: Vector | None = None  # running mean, like the size
-    size: Vector | None = None
-    yaw: float | None = None
+    votes: Votes = field(default_factory=dict)  # sum of confidences by label
+    place: Place | None = None  # running mean, like the size
+    size: Sides | None = None
+    yaw: Angle | None = None
     looked: float | None = None  # time of the last look, with or without a detection
     judged: float | None = None  # time of the last step of the alarm
-    looks: float = 0.0  # number of looks with a detection
+    named: str | None = None  # label in the last event about it
+    looks: Annotated[float, Field(ge=0)] = 0.0  # number of looks with a detection
     missed: float = 0.0  # number of looks without one, since the last detection
     is_confirmed: bool = False
     verdict: str | None = None  # kind of alarm in the last answer
@@ -103,7 +113,15 @@ class Track:
     @property
     def confidence(self) -> float:
         """Probability that the thing exists and has its label."""
-        return self.exists * self.share(self.label)
+        return self.exists * self.labels[self.label]
+
+    @property
+    def labels(self) -> dict[str, float]:
+        """Probabilities of the labels, if the thing exists. Rare votes count as errors."""
+        # One swapped label in ten looks must not make the service doubt the other nine.
+        label, shares = self.label, {one: self.share(one) for one in self.votes}
+        notable = {k: share for k, share in shares.items() if share >= NOTABLE or k == label}
+        return {one: share / sum(notable.values()) for one, share in notable.items()}
 
     def share(self, label: str) -> float:
         """Return the share of a label in the votes."""
@@ -130,10 +148,10 @@ class Track:
         label = self.label
         thing: dict[str, Any] = {"id": self.id, "label": label}
         thing["confidence"] = max(0.01, round(self.confidence, 3))
-        others = [(self.share(one), one) for one in self.votes if one != label]
-        if others and (second := max(others))[0] >= NOTABLE:
-            share = max(0.01, round(self.exists * second[0], 3))
-            thing["alternatives"] = [{"label": second[1], "confidence": share}]
+        if others := [(share, one) for one, share in self.labels.items() if one != label]:
+            share, second = max(others)
+            share = max(0.01, round(self.exists * share, 3))
+            thing["alternatives"] = [{"label": second, "confidence": share}]
         if self.place is not None:
             thing["position"] = [round(value, 3) for value in plus(self.place, shift)]
         if self.size is not None:

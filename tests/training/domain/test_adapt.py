@@ -64,7 +64,7 @@ def test_a_confirmed_object_is_never_reported_again(store, tmp_path):
     assert alarms(home(store), INTRUDER, "bedroom") == []
     parent, adapted_one = stored(store, "default"), stored(store, "home")
     assert adapted_one.manifest.training["parent"]["digest"] == parent.digest
-    text = f"adapted to one home from {'@'.join(parent.key)}"
+    text = f"adapted to one home from {'@'.join(parent.key)} with 1 recorded scene of this home."
     assert text in " ".join(adapted_one.card.split())
     for command in (["evaluate", "home"], ["publish", "home@1.0.0", "1.0.1"]):
         output = invoke(*command, "--store", store.root, code=1)
@@ -87,7 +87,7 @@ def test_a_home_keeps_the_terms_of_its_parent(store, tmp_path):
     assert not manifest.data[-1].research_only, "the scenes of the home"
     card = stored(store, "home").card
     assert f"Terms of the weights: {terms}" in card
-    assert "**Research use.** These weights were trained on" in card
+    assert "Use the weights for research only" in card
 
 
 @pytest.mark.parametrize(
@@ -245,6 +245,9 @@ def test_five_habits_are_learnt_from_a_hundred_scenes(store, tmp_path):
     assert len(reported[1]) <= 2  # below 5 % of 50 scenes
     assert alarms(after, INTRUDER) == ["toilet"]  # an object that no scene shows stays wrong
     assert str(store.aliases()["default"]) == "home@1.0.0"
+    card = stored(store, "home@1.0.0").card
+    assert "with 100 recorded scenes of this home." in card
+    assert "raises an alarm, right or wrong, in " in card
     assert f"to roll back: python -m app.registry alias default {'@'.join(key)}" in output
     # `default` is now the home, whose parent is adapted again.
     few = write(reported[0][:15], tmp_path / "few.jsonl")  # the weights stay

@@ -3,6 +3,7 @@ from pathlib import Path
 
 import pytest
 
+from app.registry import DataSource
 from app.scene import Vocabulary
 from tests.training.commands import small_config
 from training.datasets import generate_rooms, split
@@ -15,6 +16,7 @@ from training.fit.draft import as_stored, draft_artifact
 from training.fit.objects import ObjectScenes
 from training.fit.trainer import new_machine
 from training.runs.pipeline import prepare
+from training.runs.publish import data_sources
 
 CONFIG = small_config("small", "rbm", rooms=120, split="stable")
 
@@ -31,23 +33,41 @@ def test_a_comparison_covers_all_tasks_and_notes_lacking_classes_alone(lacking) 
     machine = new_machine(CONFIG, data, objects)
     other = Vocabulary(classes, scenes.vocabulary.room_types)
     a, b = (
-        Candidate(title, CONFIG, scenes.digests, draft_artifact(as_stored(machine), vocabulary))
+        Candidate(
+            title,
+            CONFIG,
+            data_sources(scenes),
+            draft_artifact(as_stored(machine), vocabulary),
+            terms="Ours.",
+        )
         for title, vocabulary in (("new", scenes.vocabulary), ("old", other))
     )
     found = compare(a, b, Path(), say=lambda _: None)
     assert ["old lacks 1 of these classes" in note for note in found.notes] == [True] * lacking
     assert {row.task for row in found.results.differences} == set(COMPARED)
+    summary = found.summary()
+    assert summary[0] == "A learnt from 120 scenes of 1 source (rooms), all seen."
+    assert summary[1].startswith(f"A knows {(~scenes.vocabulary.structure).sum()} kinds of things")
+    assert summary[2].startswith(
+        "With the default sensitivity, A raises a wrong alarm in 0.0 % (B:"
+    )
+    assert summary[3].startswith("A judges no object")
+    assert summary[4].endswith("A commercial robot may use the weights under their terms: Ours.")
 
 
 SCENES = {"rooms": generate_rooms(500, 0)}
-REFERENCE = Candidate(BASELINES, None, {}, None)
+REFERENCE = Candidate(BASELINES, None, (), None)
 LEARNT = {"rooms": digest_of(SCENES["rooms"])}
 
 
 def candidate(title: str, learnt=LEARNT, **data) -> Candidate:
     # Any artifact except None stands for a model, because only its split matters.
     config = small_config("rooms", "rbm", rooms=500, **data)
-    return Candidate(title, config, learnt, scene_model="a model")  # type: ignore[arg-type]
+    sources = tuple(
+        DataSource(source=name, scenes=1, digest=digest, terms="ours", research_only=False)
+        for name, digest in learnt.items()
+    )
+    return Candidate(title, config, sources, scene_model="a model")  # type: ignore[arg-type]
 
 
 def learnt_groups(seed: int, protocol) -> set[str]:

@@ -12,8 +12,8 @@ from tests.training.commands import small_config
 from training.datasets import EncodedScene
 from training.datasets.batches import TrainingData, subset
 from training.domain.candidates import Candidate
-from training.domain.compare import RELATIONAL, Comparison, unmeasured
-from training.domain.gate import Usefulness, losses, measure_usefulness, served_model
+from training.domain.compare import ALARMS, RELATIONAL, Comparison, unmeasured
+from training.domain.gate import Usefulness, measure_usefulness, served_model
 from training.evaluation.metrics import Figure
 from training.evaluation.results import Difference, Results
 from training.fit.configuration import Config
@@ -56,12 +56,52 @@ def test_a_refusal_names_every_metric_that_is_worse() -> None:
         ("T3 outliers", "hit@1, uniform", -0.3, -0.1),
         ("T1b completion", "R-precision", 0, 1),
     )
-    (text,) = losses(found, 0.02)
+    (text,) = found.objections(0.02)
     assert "missing objects, MRR, one removed -0.250" in text
     assert "hit@1" in text
     assert "R-precision" not in text
     assert found.to_dict()["differences"][0]["verdict"] == "worse"
-    assert losses(comparison(), 0) == []
+    assert comparison().objections(0) == []
+
+
+LESS = ("T2 missing", "top-10", -0.2, -0.1)
+MORE = ("T1b completion", "R-precision", 0.1, 0.2)
+
+
+def test_a_promotion_in_spite_of_a_worse_row_says_why() -> None:
+    """Losses that prevent no promotion: of other metrics, within the margin, and more alarms."""
+    within = ("T2 missing", "MRR, one removed", -0.2, -0.01)
+    alarms = (ALARMS, "alarms, medium, 2 classes", 0.1, 0.2)
+    found = comparison(LESS, within, alarms, MORE)
+    assert found.objections(0.02) == []
+    assert found.accepted(0.02) == (
+        "These losses prevent no promotion: missing objects, top-10 (not a primary metric); "
+        "missing objects, MRR, one removed (not certainly by more than 0.02); alarms in untouched "
+        "parts, alarms, medium, 2 classes (not a primary metric)."
+    )
+    assert "MRR, one removed" not in found.accepted(0.0), "this loss prevents the promotion"
+    assert comparison(MORE).accepted(0.02) == ""
+
+
+@pytest.mark.parametrize(
+    ("rows", "advice"),
+    [
+        ([MORE, LESS], "Promote A: it is better in 1 of 2 metrics and worse in 1."),
+        ([LESS], "A promotion of A brings no certain gain: A is better in 0 of 1 metrics and"),
+        (
+            [MORE, ("T1a relations", "R-precision, instance counts", -0.3, -0.2)],
+            "Do not promote A: new is worse than old by more than 0.02: relations of a scene, R-pr",
+        ),
+    ],
+)
+def test_the_advice_follows_the_verdicts(rows, advice) -> None:
+    found = replace(comparison(*rows), about=("data", "knowledge", "limits", "May be used."))
+    summary = found.summary()
+    assert summary[:2] + summary[3:4] == ["data", "knowledge", "limits"]
+    assert summary[2].startswith("How often A raises a wrong alarm is unknown")
+    assert summary[4].startswith(advice)
+    assert summary[4].endswith(" May be used.")
+    assert found.to_dict()["summary"] == summary
 
 
 @pytest.mark.parametrize(
@@ -73,11 +113,12 @@ def test_a_refusal_names_every_metric_that_is_worse() -> None:
     ],
 )
 def test_a_model_without_relation_metrics_replaces_no_model_with_them(measured, task, expected):
-    holder = Candidate("old", None, {}, None, tasks=frozenset(measured))
+    holder = Candidate("old", None, (), None, tasks=frozenset(measured))
     names = unmeasured([difference(task, "MRR", -0.1, 0.1)], holder)
     assert len(names) == expected
     assert set(names) < set(RELATIONAL)
-    reasons = losses(replace(comparison(("T2 missing", "MRR", -0.1, 0.1)), unmeasured=names), 0.02)
+    found = replace(comparison(("T2 missing", "MRR", -0.1, 0.1)), unmeasured=names)
+    reasons = found.objections(0.02)
     assert len(reasons) == bool(names)
     for text in reasons:
         assert "old was measured in relations of a scene, false relation, but new was not" in text

@@ -35,15 +35,15 @@ def test_an_inventory_alone_makes_a_proposal(ward, tmp_path) -> None:
     folder = tmp_path / "ward"
     output = init(ward, folder=folder, options=("--terms", "ours"))
     each = load_config(str(folder)).data.written
-    assert f"5 written places, of which training draws {each} scenes each; 0 seen" in output
+    assert f"6 written places, of which training draws {each} scenes each; 0 seen" in output
     assert "warning" not in output
     assert "no contradictions found" in output
     assert f"python -m training train {folder} --publish 1.0.0 --store my-store" in output
     scenes = prepared(folder)
-    assert scenes.counts == {"ward.csv": 5 * each}
+    assert scenes.counts == {"ward.csv": 6 * each}
     # Every place is in every part, and every written thing is a class.
     for part in scenes.parts.values():
-        assert len({one.group for one in part}) == 5
+        assert len({one.group for one in part}) == 6
         assert all(one.room_type >= 0 for one in part)
         assert not any(one.unknown for one in part)
     written = {item.label for place in read_inventory(ward).places for _, item in place.items}
@@ -71,7 +71,7 @@ def test_an_inventory_joins_scenes(ward, tmp_path) -> None:
     assert "left out, because they name no kind of object: object_0 (1), object_1 (1)" in output
     scenes = prepared(tmp_path / "ward")
     each = load_config(str(tmp_path / "ward")).data.written
-    assert scenes.counts == {"seen": 10, "ward.csv": 5 * each}
+    assert scenes.counts == {"seen": 10, "ward.csv": 6 * each}
     assert "robot" in scenes.vocabulary.labels
     assert not any(label.startswith("object") for label in scenes.vocabulary.labels)
     shares = {source.source: source for source in data_sources(scenes, learnt(scenes))}

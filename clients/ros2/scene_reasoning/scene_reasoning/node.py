@@ -34,7 +34,7 @@ from tf2_ros import Buffer, TransformException, TransformListener
 from vision_msgs.msg import Detection2DArray, Detection3DArray, LabelInfo
 from visualization_msgs.msg import MarkerArray
 
-from scene_client import Client, ClientError, Event, Home, Settings
+from scene_client import Client, ClientError, Event, Home, Settings, UnknownThingError
 from scene_client.frames import CONVENTIONS
 from scene_client.ros_fields import MessageError, frame_of
 from scene_reasoning import messages
@@ -271,8 +271,8 @@ class SceneNode(Node):
         try:
             self._publish(home, home.confirm(request.id))
             response.success = True
-        except KeyError:
-            response.success, response.message = False, f"no thing has the id {request.id!r}"
+        except UnknownThingError as error:
+            response.success, response.message = False, str(error)
         return response
 
     def destroy_node(self) -> None:
