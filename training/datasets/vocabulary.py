@@ -23,7 +23,6 @@ from app.model.fields import first_error
 from app.registry import VocabularyEntry
 from app.scene import ObjectClass, Vocabulary, head_of, label_key
 from app.scene.labels import names_nothing, without_instance
-from scene_client.schemas.requests import MAX_LABEL
 from training.datasets.records import AnnotatedScene
 
 NAMES_FILE = Path(__file__).resolve().parent / "vocabularies" / "names.toml"
@@ -291,16 +290,12 @@ def plain_label(label: str) -> str:
 
 
 def plain_scenes(scenes: Iterable[AnnotatedScene]) -> tuple[list[AnnotatedScene], Counter[str]]:
-    """Return the scenes with plain labels, and the left-out labels.
-
-    Placeholders are left out, and labels with more than `MAX_LABEL` characters, which are cut.
-    """
+    """Return the scenes with plain labels and without placeholders, and the left-out labels."""
     left_out: Counter[str] = Counter()
     plain = []
     for scene in scenes:
-        labels = [thing.label for thing in scene.objects]
-        empty = [len(label) > MAX_LABEL or is_placeholder(label) for label in labels]
-        left_out.update(x[:MAX_LABEL] for x, drop in zip(labels, empty, strict=True) if drop)
+        empty = [is_placeholder(thing.label) for thing in scene.objects]
+        left_out.update(x.label for x, drop in zip(scene.objects, empty, strict=True) if drop)
         if any(empty):
             scene = scene.only([k for k, drop in enumerate(empty) if not drop])
         labels = [plain_label(thing.label) for thing in scene.objects]

@@ -30,7 +30,7 @@ from app.inference import Weights
 from app.model import SceneModel
 from app.scene import CANONICAL
 from training.domain.home import MAX_EXCEPTIONS, Home, alarms_of, with_exceptions
-from training.domain.true_intruders import LARGEST_LOSS, Case, lost, popularity, true_intruders
+from training.domain.true_intruders import LARGEST_LOSS, Case, lost, true_intruders
 from training.fit.adapt import adapt, part_loss
 from training.fit.adapt_statistics import with_numbers, with_places
 from training.fit.objects import random_parts
@@ -91,9 +91,10 @@ def adapted(
     home: Home, *, seed: int = 0, progress: Callable[[str], None] = lambda _: None
 ) -> Adapted:
     """Adapt a model to a home."""
-    model, measured, objections = _weights(home, seed, progress)
     progress("asking about true intruders")
-    exceptions, refused = _exceptions(home, model, seed)
+    cases = true_intruders(home.parent, seed)
+    model, measured, objections = _weights(home, cases, seed, progress)
+    exceptions, refused = _exceptions(home, model, cases)
     model, numbers = with_numbers(with_exceptions(model, exceptions), home.numbers)
     model = with_places(model, home.relations, home.places)
     is_new = model.weights is not home.parent.weights
@@ -113,7 +114,7 @@ def adapted(
 
 
 def _weights(
-    home: Home, seed: int, progress: Callable[[str], None]
+    home: Home, cases: list[Case], seed: int, progress: Callable[[str], None]
 ) -> tuple[SceneModel, Measured | None, tuple[str, ...]]:
     """Return the model with adapted weights, or the parent and the reasons against the weights."""
     if len(home.measurable) < FEWEST:
@@ -125,23 +126,20 @@ def _weights(
     progress("adapting to all scenes")
     weights = adapt(home.parent.weights, home.tensors, trained_on=home.trained_on, seed=seed)
     model = replace(home.parent, weights=weights)
-    # Weights can only hide the classes of the recordings.
-    recorded = (home.tensors.v > 0).any(0).numpy()
-    recorded[[*home.habits]] = False
-    objections += _blindness(model, true_intruders(home.parent, recorded.astype(float), seed))
+    objections += _blindness(model, cases)
     return (home.parent if objections else model), measured, tuple(objections)
 
 
-def _exceptions(home: Home, model: SceneModel, seed: int) -> tuple[Counter[str], tuple[str, ...]]:
+def _exceptions(
+    home: Home, model: SceneModel, cases: list[Case]
+) -> tuple[Counter[str], tuple[str, ...]]:
     """Return the exceptions of a home, and the reasons against more or against all of them."""
-    found = home.reported(model)
+    found = home.confirmed_alarms(model)
     exceptions, reasons = Counter(dict(found.most_common(MAX_EXCEPTIONS))), []
     if more := len(found) - len(exceptions):
         reasons.append(f"{more} more classes are beyond the {MAX_EXCEPTIONS} of a home")
-    if exceptions:
-        cases = true_intruders(home.parent, popularity(home.parent), seed)
-        if blind := [*_blindness(with_exceptions(model, exceptions), cases)]:
-            return Counter(), (*blind, *reasons)
+    if exceptions and (blind := [*_blindness(with_exceptions(model, exceptions), cases)]):
+        return Counter(), (*blind, *reasons)
     return exceptions, tuple(reasons)
 
 

@@ -39,7 +39,6 @@ from app.questions.misplaced import THE_FLOOR
 from app.questions.outliers import intruders
 from app.scene import ObjectClass, Scene, Vocabulary, label_key
 from app.scene.spatial_relations import STACKED
-from scene_client.schemas.requests import MAX_LABEL
 from training.datasets import AnnotatedScene, encode
 from training.datasets.cases import Triple, scene_of
 from training.datasets.inventories import SHARE, Place, complete_scene, shipped_inventory
@@ -47,7 +46,7 @@ from training.datasets.moved import has_boxes, posed_scene
 from training.datasets.vocabulary import curated_names
 from training.evaluation.asking import canonical_triple, index_of_ids, score_misplaced
 from training.evaluation.parts import of_classes
-from training.fit.adapt import HomeScenes, TrainedOn, extended, usual_classes
+from training.fit.adapt import HomeScenes, TrainedOn, extended
 from training.fit.adapt_statistics import Numbers
 
 JUDGED: Final = 3  # number of scenes with a new class from which its objects are judged
@@ -89,8 +88,6 @@ class Home:
     recorded: int  # number of recorded scenes, with the repeated ones
     # Ids of the unconfirmed scenes in which each label is left out.
     left_out: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    # Room type and class of the alarms of the parent in confirmed scenes.
-    confirmed_alarms: frozenset[tuple[int | None, int]] = frozenset()
     relations: frozenset[Triple] = frozenset()  # confirmed, but misplaced for the parent
     # Other relations, with the number of their recorded scenes; at least `JUDGED`.
     places: Mapping[Triple, int] = field(default_factory=dict)
@@ -131,7 +128,6 @@ class Home:
             scenes=(*read, *(_written(parent, place) for place in places)),
             recorded=len(recorded),
             left_out=left_out,
-            confirmed_alarms=frozenset(habits),
             relations=frozenset(reported),
             places={triple: n for triple, n in repeated.items() if n >= JUDGED},
             numbers=tuple(
@@ -189,13 +185,7 @@ class Home:
         weights = weights_of_hours([None if x.written else x.group for x in self.scenes])
         return HomeScenes(v, observed, torch.tensor(rooms), torch.from_numpy(weights).float())
 
-    @property
-    def habits(self) -> frozenset[int]:
-        """Classes with a confirmed alarm that are usual in the recorded scenes of the room type."""
-        usual = usual_classes(self.tensors, max(self.parent.spec.C, 1))
-        return frozenset(c for t, c in self.confirmed_alarms if t is not None and usual[t, c])
-
-    def reported(self, artifact: SceneModel) -> Counter[str]:
+    def confirmed_alarms(self, artifact: SceneModel) -> Counter[str]:
         """Return the classes that a model reports, with the number of their confirmed scenes."""
         labels, counts = artifact.vocabulary.labels, Counter[str]()
         for scene in self.scenes:
@@ -276,10 +266,10 @@ def _with_new_words(
 
 
 def _commonest(counts: Counter[str]) -> list[str]:
-    """Return the words without those that are too long, the commonest first, one for each key."""
+    """Return the words, the commonest first, one for each key."""
     ordered = sorted(counts, key=lambda word: (-counts[word], word))
     by_key = {label_key(word): word for word in reversed(ordered)}
-    return [word for word in ordered if by_key[label_key(word)] == word and len(word) <= MAX_LABEL]
+    return [word for word in ordered if by_key[label_key(word)] == word]
 
 
 _Distinct = list[tuple["HomeScene", AnnotatedScene]]

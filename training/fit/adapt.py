@@ -11,7 +11,7 @@ their rows of W and columns of Y. The fit minimises
   fit draws scenes in proportion to their weights, and n is the sum of the weights.
 - The second line is distillation: both machines predict unlisted classes and room types of the
   stored samples. Without it, the machine forgets other rooms. The usual classes of a recorded room
-  type (`usual_classes`) have no part in the samples of that type, because the home knows better.
+  type (`_usual`) have no part in the samples of that type, because the home knows better.
 - Few scenes without a class k do not prove that the home lacks it. Let the parent expect the class
   in E_k of the n scenes. If no scene shows it, its target is the answer of the parent, divided by
   1 + E_k: the posterior mean of a rate with the prior exp(-rate), given no event. Only δ_k follows
@@ -124,7 +124,7 @@ class _Fit:
         # The stored samples do not show new classes, so these are unobserved there.
         samples = torch.from_numpy(parent.chain_samples)
         rooms = torch.from_numpy(parent["fantasy_rooms"]).long()
-        usual = usual_classes(scenes, max(parent.spec.C, 1))
+        usual = _usual(scenes, max(parent.spec.C, 1))
         hides = new | (usual[rooms] & (rooms >= 0).unsqueeze(1))
         self._samples = HomeScenes(samples, ~hides, rooms, torch.ones(len(samples)))
         self._samples = self._samples.rows(samples.sum(1) >= 2)
@@ -233,7 +233,7 @@ class _Fit:
         return total
 
 
-def usual_classes(scenes: HomeScenes, C: int) -> Bool[Tensor, "C V"]:
+def _usual(scenes: HomeScenes, C: int) -> Bool[Tensor, "C V"]:
     """Return the classes that most recorded scenes of each room type show, and at least three."""
     of_room = one_hot(scenes.room[scenes.room >= 0], C).float().T
     shown, total = of_room @ scenes.v[scenes.room >= 0], of_room.sum(1, keepdim=True)
