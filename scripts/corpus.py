@@ -35,7 +35,7 @@ TOLERANCE: Final = 1e-5
 SEED: Final = 20261123
 QUESTIONS: Final = ("relations", "missing", "outliers", "rooms")
 MODELS: Final = (
-    "default", "places-triway", "places-rbm", "places-triway@4.5.0",
+    "default", "places-triway", "places-rbm", "places-triway@4.5.1",
 )  # fmt: skip
 RELATIONS: Final = (
     *("left", "right", "front", "behind", "on-top"),
@@ -210,7 +210,7 @@ def questions(client: httpx.Client, rng: random.Random) -> Iterator[dict[str, Js
         likely = [scene["objects"] for scene in drawn["scenes"] if scene["objects"]]
         labels = [entry["label"] for entry in words["objects"]]
         scenes = Scenes(rng, labels, words["room_types"], likely)
-        count = 60 if model == "places-triway@4.5.0" else 210
+        count = 60 if model == "places-triway@4.5.1" else 210
         for k in range(count):
             question = QUESTIONS[k % len(QUESTIONS)]
             body = scenes.scene() | {"model": model}

@@ -1,6 +1,6 @@
 """Compare served log-odds with the conditionals of the joint distribution of a machine.
 
-    python -m training.research.joint places-triway@4.5.0 scenes.jsonl
+    python -m training.research.joint places-triway@4.5.1 scenes.jsonl
 
 A request without a profile has an unknown data source q. The answers use the mean base rate over
 the sources, sum_q p(q | listed) a_q. With q as one more unit of the machine, the joint is

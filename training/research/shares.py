@@ -1,6 +1,6 @@
 """How much of an answer comes from the machine, and how much from counts.
 
-    python -m training.research.shares places-triway@4.5.0 scenes.jsonl
+    python -m training.research.shares places-triway@4.5.1 scenes.jsonl
 
 The command asks the questions of the evaluation about the scenes of a file, with the whole model
 and with variants in which a part of the scores is left out. No variant is calibrated again, so the
