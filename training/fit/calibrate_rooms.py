@@ -11,6 +11,7 @@ smallest, room_fit
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
@@ -206,13 +207,21 @@ def _fit_limit(artifact: SceneModel, lists: Sequence[_ListedRooms], room: int) -
     """Return the limit of the fit from lists of a room type, one entry for each of `_PARTS`."""
     # The quantile over few whole rooms is the worst room, so only the smallest parts count then.
     lists = lists if len(np.unique(lists[0].scene)) >= _LONG_SCENES else lists[:1]
-    quantiles = []
-    for parts in lists:
-        fits = [room_fit(artifact, np.flatnonzero(row).tolist(), room) for row in parts.listed]
-        quantiles.append(_low_quantile(np.array(fits), parts.source))
+    fits = [
+        np.array([room_fit(artifact, np.flatnonzero(row).tolist(), room) for row in parts.listed])
+        for parts in lists
+    ]
+    quantiles = [_low_quantile(fit, x.source) for fit, x in zip(fits, lists, strict=True)]
     sizes = np.log([parts.size.mean() for parts in lists])
-    slope, intercept = np.polyfit(sizes, quantiles, 1) if np.ptp(sizes) else (0.0, quantiles[0])
-    return FitLimit(intercept=round(float(intercept), 4), log_count=round(float(slope), 4))
+    slope = round(float(np.polyfit(sizes, quantiles, 1)[0]), 4) if np.ptp(sizes) else 0.0
+    # Among few room types, the fit of long lists stops to grow, so a line through the quantiles
+    # would refuse most whole rooms. Below this line is at most the share `_LEAST` of each kind.
+    intercept = min(
+        _low_quantile(fit - slope * np.log(x.size), x.source)
+        for fit, x in zip(fits, lists, strict=True)
+    )
+    # Many rooms are equal, so the limit is rounded down: it must not refuse those at the quantile.
+    return FitLimit(intercept=math.floor(intercept * 1e4) / 1e4, log_count=slope)
 
 
 def _part_of(share: float) -> Size:

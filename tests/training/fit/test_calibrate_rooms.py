@@ -134,3 +134,12 @@ def test_the_limit_of_the_fit_depends_on_the_length_of_the_list(model, monkeypat
     few = limits_of(model, [scene([0, 1, 2, 3], room=1)] * 99)["room_fit"][1]
     assert (few.intercept, few.log_count) == (-1, 0)
     assert limit.of(4) == pytest.approx(fit(model, [0, 1, 2, 3], 1), abs=1e-3)
+
+
+def test_the_limit_admits_whole_rooms_whose_fit_grows_no_more(model, monkeypatch):
+    """A line through the quantiles would be above the fit of all whole rooms."""
+    monkeypatch.setattr(calibrate_rooms, "room_fit", lambda _, x, __: min(np.log(len(x)), 0.7))
+    limit = limits_of(model, [scene([0, 1, 2, 3], room=1)] * 100)["room_fit"][1]
+    assert limit.log_count > 0.3
+    assert limit.of(4) == pytest.approx(0.7, abs=1e-3)
+    assert all(limit.of(n) <= min(np.log(n), 0.7) for n in (1, 2, 3, 4))
