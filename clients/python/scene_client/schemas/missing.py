@@ -38,8 +38,8 @@ class MissingRequest(SceneRequest):
     objects: SomeObjects
     coverage: Probability | None = None
     """share of the real scene's classes that the request lists. With 1, at most one class is
-    missing. Values below 0.15 mean 0.15. Default: the value of the model, which gave validation
-    scenes the best answers"""
+    missing. Values below 0.15 mean 0.15. Without it, the share is unknown, and the probabilities
+    are right on average over lists of any share"""
     top_k: Annotated[int, Field(ge=1)] = 10
     """maximum number of classes in the answer"""
     candidates: Annotated[
@@ -150,7 +150,8 @@ class MissingAnswer(Answer):
     """Unlisted classes, most probable first. Their probabilities do not sum to one."""
 
     coverage: Probability | None = None
-    """value of `coverage` that the service has used"""
+    """`coverage` of the request. Without one, it is the share whose base rates the model uses for
+    an unknown share, and a request that states this number gets other probabilities"""
     missing: list[MissingObject]
     more: list[MoreInstances] = []
     """listed classes with probably more instances than listed, most probable first. Without
