@@ -15,8 +15,9 @@ Each row of the table is one thing at one usual location in a place:
 A table `things.csv` in the same folder describes the things: sizes, where they stand, broader and
 other names.
 
-`draw_scene` samples this model exactly. A careful visitor's list is longer than any detector's, so
-training uses parts of the drawn scenes (`detected_part`).
+`draw_scene` samples this model exactly. A user's shares are those of the lists of a robot, so
+training uses whole scenes. The inventory of the repository lists what a careful visitor sees, which
+is more than any detector lists, so training uses parts of its scenes (`detected_part`).
 """
 
 import math
@@ -35,7 +36,7 @@ from training.datasets.array_types import Rng
 from training.datasets.files import KNOWLEDGE
 from training.datasets.records import MAX_COUNT, AnnotatedObject, AnnotatedScene, DatasetError
 from training.datasets.tables import Errors, Row, read_table
-from training.datasets.vocabulary import curated_names, is_placeholder
+from training.datasets.vocabulary import is_placeholder
 
 SOURCE: Final = "inventories"  # source name of the written scenes of the repository
 
@@ -184,15 +185,15 @@ class Inventory:
     things: Mapping[str, Thing]  # things of `things.csv` by label; empty without this file
     left_out: Counter[str]  # labels of rows that name no kind of object
 
-    def scenes(self, each: int, seed: int, *, synonyms: bool = True) -> list[AnnotatedScene]:
-        """Draw parts of a number of scenes of each place. The scenes of a place are one group.
+    def scenes(self, each: int, seed: int) -> list[AnnotatedScene]:
+        """Draw a number of whole scenes of each place. The scenes of a place are one group."""
+        return [scene for scene, _ in _drawn(self.places, each, seed)]
 
-        With `synonyms`, a curated synonym such as "hospital bed" is listed as often as its thing.
-        """
-        rates = detection_rates((*self.things.values(), *shipped_things().values()))
-        if synonyms:
-            rates = _of_synonyms(rates) | rates
-        return written_scenes(self.places, rates, each, seed)
+    def detected_scenes(self, each: int, seed: int) -> list[AnnotatedScene]:
+        """Draw the part that a detector lists of a number of scenes of each place."""
+        rates = detection_rates(self.things.values())
+        drawn = _drawn(self.places, each, seed)
+        return [detected_part(scene, rates, rng) for scene, rng in drawn]
 
 
 @cache
@@ -362,16 +363,6 @@ def detection_rates(things: Iterable[Thing]) -> dict[str, float]:
     return rates
 
 
-def _of_synonyms(rates: Mapping[str, float]) -> dict[str, float]:
-    """Return the rates of the curated synonyms of things with a rate."""
-    return {
-        label_key(name): rates[key]
-        for label, names in curated_names().aliases.items()
-        if (key := label_key(label)) in rates
-        for name in names
-    }
-
-
 def detected_part(scene: AnnotatedScene, rates: Mapping[str, float], rng: Rng) -> AnnotatedScene:
     """Return the part that a detector lists: all or no objects of a label, always the floor."""
     labels = list(dict.fromkeys(label_key(thing.label) for thing in scene.objects))
@@ -386,13 +377,9 @@ def detected_part(scene: AnnotatedScene, rates: Mapping[str, float], rng: Rng) -
     return replace(part, supported=tuple(sorted(supported)))
 
 
-def written_scenes(
-    places: Sequence[Place], rates: Mapping[str, float], each: int, seed: int
-) -> list[AnnotatedScene]:
-    """Draw detected parts of `each` scenes of a place. The scenes of a place are one group."""
+def _drawn(places: Sequence[Place], each: int, seed: int) -> Iterator[tuple[AnnotatedScene, Rng]]:
+    """Draw `each` scenes of a place. The second value continues the random stream of the scene."""
     rngs = np.random.default_rng(seed).spawn(len(places))
-    return [
-        detected_part(draw_scene(place, f"{place.name} {number}", rng), rates, rng)
-        for place, rng in zip(places, rngs, strict=True)
-        for number in range(each)
-    ]
+    for place, rng in zip(places, rngs, strict=True):
+        for number in range(each):
+            yield draw_scene(place, f"{place.name} {number}", rng), rng

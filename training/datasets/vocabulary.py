@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from pydantic import ValidationError
@@ -45,6 +45,24 @@ class Names:
     kinds: dict[str, tuple[str, ...]] = field(default_factory=dict)
     # Other names of each room type. The key "" lists names without a room type.
     rooms: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def telling_apart(self, labels: Iterable[str]) -> Self:
+        """Return names in which the labels of a person are different classes.
+
+        Of several labels of one class, its name or else the first label keeps the other names. A
+        label that ends with the name is a kind of the class: coffee cup of cup.
+        """
+        labels_of: defaultdict[str, dict[str, str]] = defaultdict(dict)
+        for label in labels:
+            labels_of[self.canonical(label)].setdefault(label_key(label), _plain(label))
+        aliases, kinds = dict(self.aliases), dict(self.kinds)
+        for name, own in labels_of.items():
+            own.pop(label_key(name) if label_key(name) in own else next(iter(own)))
+            of_class = {label_key(x): x for x in aliases.get(name, ())}
+            told_apart = [label for key, label in own.items() if of_class.pop(key, None)]
+            aliases[name] = tuple(of_class.values())
+            kinds[name] = (*kinds.get(name, ()), *(x for x in told_apart if is_kind(x, name)))
+        return replace(self, aliases=aliases, kinds=kinds)
 
     def is_curated(self, label: str) -> bool:
         """Return True if a label is a curated name of a class in any spelling."""
@@ -83,6 +101,12 @@ class Names:
     @cached_property
     def _rooms_by_key(self) -> dict[str, str]:
         return _by_any_name(self.rooms)
+
+
+def is_kind(label: str, name: str) -> bool:
+    """Return True if a label is a name after further words: visitor chair for chair."""
+    words, last = _plain(label).split(), len(name.split())
+    return len(words) > last and label_key(" ".join(words[-last:])) == label_key(name)
 
 
 def _plain(name: str) -> str:
@@ -180,11 +204,11 @@ def vocabulary_text(values: Mapping[str, Any]) -> str:
 
 def with_aliases(vocabulary: Vocabulary) -> Vocabulary:
     """Return the vocabulary with curated synonyms, kinds and parents. Labels and sizes stay."""
-    aliases, objects = curated_names().aliases, []
+    names, objects = curated_names(), []
     for entry in vocabulary.objects:
-        synonyms = (x for x in aliases.get(entry.label, ()) if vocabulary.index(x) is None)
+        synonyms = (x for x in names.aliases.get(entry.label, ()) if vocabulary.index(x) is None)
         objects.append(replace(entry, aliases=(*entry.aliases, *synonyms)))
-    return with_room_aliases(_with_kinds(Vocabulary(objects, vocabulary.room_types)))
+    return with_room_aliases(_with_kinds(Vocabulary(objects, vocabulary.room_types), names))
 
 
 def with_room_aliases(vocabulary: Vocabulary) -> Vocabulary:
@@ -218,8 +242,12 @@ def source_vocabulary(
     minimum: int = MINIMUM_MENTIONS,
     required: Iterable[str] = (),
 ) -> Vocabulary:
-    """Build a vocabulary of the frequent classes of one data source and the `required` labels."""
-    names = curated_names()
+    """Build a vocabulary of the frequent classes of one data source and the `required` labels.
+
+    Different required labels are different classes, also if they are curated synonyms.
+    """
+    required = tuple(required)
+    names = curated_names().telling_apart(required)
     # An empty entry preserves the curated spelling of a class without aliases.
     spellings = dict.fromkeys((*names.base, *names.household, *names.structure), ())
     aliases = spellings | names.aliases
@@ -227,12 +255,12 @@ def source_vocabulary(
     # Without kinds, a specific name becomes an alias: "coffee table" of "table". `_with_kinds` adds
     # the curated specific names that no class has.
     mentioned_only = replace(names, base=base, household=(), kinds={}, aliases=aliases)
-    return _with_kinds(build_vocabulary(scenes, mentioned_only, minimum=minimum))
+    return _with_kinds(build_vocabulary(scenes, mentioned_only, minimum=minimum), names)
 
 
-def _with_kinds(vocabulary: Vocabulary) -> Vocabulary:
+def _with_kinds(vocabulary: Vocabulary, names: Names) -> Vocabulary:
     """Set the parents of classes, and add the names of their kinds without a class as aliases."""
-    names, objects = curated_names(), []
+    objects = []
     for entry in vocabulary.objects:
         parent = names.broader.get(entry.label)
         while parent is not None and parent not in vocabulary.labels:

@@ -12,6 +12,7 @@ from training.datasets.inventories import Thing, shipped_inventory
 from training.datasets.vocabulary import (
     INDOOR_FILE,
     curated_names,
+    is_kind,
     read_vocabulary,
     with_room_aliases,
 )
@@ -93,7 +94,8 @@ def with_things(vocabulary: Vocabulary, things: Mapping[str, Thing]) -> Vocabula
     for entry in vocabulary.objects:
         keys = map(label_key, (entry.label, *entry.aliases))
         if (match := next(filter(None, map(described.get, keys)), None)) is not None:
-            aliases.add(entry.label, (match.label, *match.other_names))
+            if not is_kind(entry.label, match.label):
+                aliases.add(entry.label, (match.label, *match.other_names))
             parent = names.get(_broader(match, things, with_class) or "")
             if parents[entry.label] is None and entry.label not in _ancestors(parent, parents):
                 parents[entry.label] = parent

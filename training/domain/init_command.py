@@ -10,7 +10,6 @@ from typing import Annotated, Literal
 
 import typer
 
-from app.scene import label_key
 from training.datasets import DatasetError, generate_rooms
 from training.datasets.console import console, print_lines, print_marked
 from training.datasets.files import write_whole
@@ -160,11 +159,11 @@ def _show(proposal: Proposal, classes: str) -> None:
         f"scenes with: {shares}",
         f"{len(proposal.vocabulary)} {classes}; they cover {proposal.coverage:.1%} of the objects",
     ]
-    joined = [x for x in proposal.labels if label_key(x.name) != label_key(x.spellings[0])]
-    lines += listing(
-        "joined by built-in synonyms; vocabulary.json has the classes:",
-        [f"{label.spellings[0]} = {label.name}" for label in joined],
-    )
+    joined, kinds, renamed = proposal.read_otherwise()
+    title = "joined with a class by built-in synonyms; vocabulary.json has the classes:"
+    lines += listing(title, joined)
+    lines += listing("kinds, which share weights with the broader class:", kinds)
+    lines += listing("room types that have another name in answers:", renamed)
     lines += listing("labels without a class:", _mentions(proposal.dropped))
     lines += filter(None, [left_out_line(proposal.material.left_out, ROWS)])
     print_lines(*lines)

@@ -18,7 +18,7 @@ from app.scene import Vocabulary, label_key
 from training.datasets import AnnotatedScene, source_vocabulary, split
 from training.datasets.inventories import complete_scene
 from training.datasets.splits import FRACTIONS
-from training.datasets.vocabulary import coverage
+from training.datasets.vocabulary import coverage, curated_names, is_kind
 from training.datasets.written import with_things
 from training.domain.look import Facts, Label, count_labels, look
 from training.domain.material import Material
@@ -66,6 +66,25 @@ class Proposal:
             f"{len(places)} written places, of which training draws {each} scenes each; "
             f"{len(seen)} seen scenes. The lines below count a written place as one complete scene"
         ]
+
+    def read_otherwise(self) -> tuple[list[str], list[str], list[str]]:
+        """Return the labels without a class of this name, the kinds, and the renamed room types."""
+        words, names = self.vocabulary, curated_names()
+        joined, kinds = [], []
+        for label in (spelling for entry in self.labels for spelling in entry.spellings):
+            if (index := words.index(label)) is None:
+                continue
+            if label_key(words.labels[index]) != label_key(label):
+                joined.append(f"{label} = {words.labels[index]}")
+            elif (parent := words.objects[index].parent) is not None:
+                kinds.append(f"{label} is a {parent}")
+        written = (place.room_type for place in self.material.places)
+        rooms = [
+            f"{room} = {name}"
+            for room in dict.fromkeys([*written, *(x.room_type for x in self.material.scenes)])
+            if room and (name := names.canonical_room(room)) and label_key(name) != label_key(room)
+        ]
+        return joined, kinds, rooms
 
     @property
     def warning(self) -> str:
@@ -118,10 +137,7 @@ def propose(name: str, material: Material, sources: Sequence[str], *, terms: str
     seed, parts, test_groups = _split(scenes)
     settings, reasons = _configuration(facts, parts)
     if not seen:
-        settings["objects"] |= {"weight_prior": 0.3, "rate_prior": 2.0}
-        reasons["objects.weight_prior"] = (
-            "weaker than for seen scenes: of written places, as many scenes as needed are drawn"
-        )
+        _know_the_law(settings, reasons)
     reasons |= {
         "data.vocabulary": f"{len(vocabulary)} classes of at least {minimum} mentions, or written; "
         "edit the file to change them",
@@ -157,6 +173,20 @@ def propose(name: str, material: Material, sources: Sequence[str], *, terms: str
     )
 
 
+def _know_the_law(settings: dict[str, Any], reasons: dict[str, str]) -> None:
+    """Change settings for scenes that are all drawn from a table (docs/decisions/own-scenes.md)."""
+    settings["machine"]["units"] = 16
+    drawn = {"steps": 800, "weight_prior": 0.3, "rate_prior": 2.0, "served_sweeps": 200}
+    settings["objects"] |= drawn
+    reasons |= {
+        "machine.units": "more than for seen scenes: each group of things of a place is a context",
+        "objects.steps": "more than for seen scenes, because the priors are weaker",
+        "objects.weight_prior": "weaker than for seen scenes: of written places, as many scenes as "
+        "needed are drawn",
+        "objects.served_sweeps": "generated scenes have the shares of the table",
+    }
+
+
 def _choose_vocabulary(
     scenes: Sequence[AnnotatedScene], required: Sequence[str]
 ) -> tuple[int, Vocabulary]:
@@ -175,18 +205,28 @@ def _choose_vocabulary(
 
 
 def use_frequent_names(vocabulary: Vocabulary, scenes: Sequence[AnnotatedScene]) -> Vocabulary:
-    """Rename each class to the alias that more than half of its objects have as label, if any."""
+    """Rename each class to the alias that more than half of its objects have as label, if any.
+
+    A class that becomes a kind, such as visitor chair for chair, keeps its old name and the labels
+    of objects. Other kinds of chairs are neither its names nor its kinds.
+    """
     key_counts: defaultdict[int | None, Counter[str]] = defaultdict(Counter)
     for thing in (thing for scene in scenes for thing in scene.objects):
         key_counts[vocabulary.index(thing.label)][label_key(thing.label)] += 1
-    objects, name_of = [], {}
+    objects, name_of, narrower = [], {}, set()
     for index, entry in enumerate(vocabulary.objects):
         half = key_counts[index].total() / 2
         common = [x for x in entry.aliases if key_counts[index][label_key(x)] > half]
         name_of[entry.label] = label = common[0] if common else entry.label
         others = [x for x in (entry.label, *entry.aliases) if x != label]
+        if is_kind(label, entry.label):
+            narrower.add(entry.label)
+            counts = key_counts[index]
+            others = [x for x in others if x == entry.label or counts[label_key(x)]]
         objects.append(replace(entry, label=label, aliases=tuple(others)))
-    objects = [replace(x, parent=name_of[x.parent]) if x.parent else x for x in objects]
+    for number, entry in enumerate(objects):
+        parent = None if entry.parent in narrower else entry.parent
+        objects[number] = replace(entry, parent=name_of[parent] if parent else None)
     return Vocabulary(objects, vocabulary.room_types)
 
 

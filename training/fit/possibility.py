@@ -137,8 +137,7 @@ def _written_weights() -> Float[NDArray[np.float32], "4 features"]:
     """
     vocabulary, inventory = written_vocabulary(), shipped_inventory()
     possible = stated_pairs(map(complete_scene, inventory.places), vocabulary)
-    drawn = inventory.scenes(1, seed=0, synonyms=False)  # as in the shipped models
-    impossible = denied_pairs(encode(drawn, vocabulary), vocabulary)
+    impossible = denied_pairs(encode(inventory.detected_scenes(1, seed=0), vocabulary), vocabulary)
     prior = describe(vocabulary, inventory.things, _NEUTRAL)
     return _fit_weights(prior, vocabulary, possible, impossible)
 

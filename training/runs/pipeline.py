@@ -105,10 +105,9 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
         if source == "rooms":
             own = generate_rooms(data.rooms, seed=data.split_seed)
         elif is_inventory(source):
-            # The shipped models learnt from draws without synonyms: others would be other data.
-            own = inventories.read_inventory(path).scenes(
-                data.written, seed=data.split_seed, synonyms=source != inventories.SOURCE
-            )
+            inventory = inventories.read_inventory(path)
+            draw = inventory.detected_scenes if source == inventories.SOURCE else inventory.scenes
+            own = draw(data.written, seed=data.split_seed)
         elif source == PRIORS:
             own = read_prior_scenes(path)
         else:

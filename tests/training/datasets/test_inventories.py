@@ -24,8 +24,8 @@ from training.datasets.inventories import (
     draw_scene,
     read_inventory,
     read_things,
+    shipped_inventory,
     shipped_things,
-    written_scenes,
 )
 from training.datasets.records import MAX_LISTED, InvalidLinesError
 from training.datasets.written import with_things
@@ -204,9 +204,13 @@ def test_a_detector_lists_a_part_of_each_scene():
         Item("mugs", 1, 2, 2, "inside", "table"),
     )
     place = Place("den", "study", (Group("basics", 1, items),))
-    shares = detection_rates([replace(shipped_things()["table"], size=(0.5, 2.0, 0.7))])
+    things = {"table": replace(shipped_things()["table"], size=(0.5, 2.0, 0.7))}
+    shares = detection_rates(things.values())
     assert shares["table"] == pytest.approx(1 - 0.7 * math.exp(-5))
-    scenes = written_scenes([place], shares, 4000, seed=3)
+    inventory = Inventory((place,), things, Counter())
+    for whole in inventory.scenes(3, seed=3):
+        assert [thing.label for thing in whole.objects] == ["table", "mug", "mugs", "floor"]
+    scenes = inventory.detected_scenes(4000, seed=3)
     assert len({scene.scene_id for scene in scenes}) == 4000
     assert {scene.group for scene in scenes} == {"den"}
     names = [[thing.label for thing in scene.objects] for scene in scenes]
@@ -221,18 +225,6 @@ def test_a_detector_lists_a_part_of_each_scene():
         related = [(own[i], own[j]) for i, _, j in scene.relations]
         assert related == [pair for pair in pairs if set(pair) <= set(own)]
         assert [own[i] for i in scene.supported] == [subject for subject, _ in related]
-
-
-@pytest.mark.parametrize(("synonyms", "least"), [(True, 0.95), (False, 0.5)])
-def test_a_synonym_is_listed_as_often_as_its_thing(synonyms, least):
-    """A hospital bed is a bed, which a detector nearly always lists. 400 scenes."""
-    bed = Item("hospital bed", 1, 1, 1, "floor", "")
-    ward = Inventory(
-        (Place("ward", "hospital room", (Group("basics", 1, (bed,)),)),), {}, Counter()
-    )
-    drawn = ward.scenes(400, seed=1, synonyms=synonyms)
-    share = np.mean([any(one.label == "hospital bed" for one in s.objects) for s in drawn])
-    assert least - 0.1 < share < least + 0.15
 
 
 def test_things_stand_where_the_table_says():
@@ -254,9 +246,11 @@ def test_things_stand_where_the_table_says():
 
 
 def test_a_seed_gives_the_same_scenes():
-    places = read_inventory(KNOWLEDGE / "inventories.csv").places[:3]
-    assert written_scenes(places, {}, 2, seed=1) == written_scenes(places, {}, 2, seed=1)
-    assert written_scenes(places, {}, 2, seed=1) != written_scenes(places, {}, 2, seed=2)
+    own = shipped_inventory()
+    inventory = replace(own, places=own.places[:3])
+    for draw in (inventory.scenes, inventory.detected_scenes):
+        assert draw(2, seed=1) == draw(2, seed=1)
+        assert draw(2, seed=1) != draw(2, seed=2)
 
 
 def test_places_are_a_data_source_without_a_data_folder(tmp_path):

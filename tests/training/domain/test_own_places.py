@@ -7,7 +7,7 @@ import pytest
 from app import questions
 from app.model.possibility import IN, ON
 from app.registry import Store
-from app.scene import Scene
+from app.scene import Scene, label_key
 from app.scene.stands import FLOOR, SUPPORTED
 from tests.training.commands import init, invoke, prepared
 from tests.training.scenes import request, scene
@@ -46,6 +46,10 @@ def test_an_inventory_alone_makes_a_proposal(ward, tmp_path) -> None:
         assert len({one.group for one in part}) == 6
         assert all(one.room_type >= 0 for one in part)
         assert not any(one.unknown for one in part)
+    # A thing is in as many scenes as its share says, whatever its size.
+    bed = scenes.vocabulary.index("hospital bed")
+    patient_rooms = [x for x in scenes.parts["train"] if x.group == "patient room"]
+    assert all(bed in one.evidence.classes for one in patient_rooms)
     written = {item.label for place in read_inventory(ward).places for _, item in place.items}
     assert all(scenes.vocabulary.index(label) is not None for label in written)
     assert np.isfinite(scenes.vocabulary.sizes[scenes.vocabulary.index("hospital bed")]).all()
@@ -85,6 +89,26 @@ def test_as_many_written_scenes_are_drawn_as_seen_ones(tmp_path) -> None:
     (tmp_path / "two.csv").write_text("\n".join([HEAD, *rows]))
     init(tmp_path / "seen.jsonl", tmp_path / "two.csv", folder=tmp_path / "ward")
     assert load_config(str(tmp_path / "ward")).data.written == 450
+
+
+def test_each_written_thing_has_its_own_name(tmp_path) -> None:
+    """Synonyms become names, and init prints labels and room types that answers call otherwise."""
+    labels = ["cup", "coffee cup", "visitor chair", "office chair", "medicine cabinet", "TV"]
+    labels += ["television", "walking frame"]
+    rows = [f"patient room,{label},," for label in labels]
+    (tmp_path / "places.csv").write_text("\n".join([HEAD, *rows]))
+    output = init(tmp_path / "places.csv", folder=tmp_path / "ward")
+    assert "broader class: coffee cup is a cup room types" in output
+    assert "in answers: patient room = hospital room no contradictions" in output
+    words = prepared(tmp_path / "ward").vocabulary
+    own = [words.index(label) for label in labels]
+    assert [label_key(words.labels[k]) for k in own] == list(map(label_key, labels))
+    parents = {entry.label: entry.parent for entry in words.objects if entry.parent}
+    assert parents == {"coffee cup": "cup"}
+    names = {label: words.index(label) for label in ("chair", "cabinet", "walker", "mug")}
+    assert names == dict(zip(names, (own[2], own[4], own[7], own[0]), strict=True))
+    for other in ("filing cabinet", "sideboard", "armchair", "cane"):
+        assert words.index(other) is None
 
 
 def test_own_places_have_a_prior_of_possibility(tmp_path) -> None:
@@ -175,6 +199,14 @@ def test_from_the_table_to_answers(ward, tmp_path) -> None:
     assert [x["object"] for x in intruded["outliers"] if x["is_outlier"]] == ["toilet"]
     rooms = questions.rooms(model, request(model, "toilet", "mirror"))["room_types"]
     assert rooms[0]["room_type"] == "bathroom"
-    room = words.room_index("nurse station")
-    generated = questions.generate(model, Scene((), room_type=room), seed=1)["scenes"][0]
-    assert len(generated["objects"]) > 2
+    # All patient rooms have a bed.
+    others = ["pillow", "blanket", "bedside cabinet", "overbed table", "call button", "wardrobe"]
+    for count in (3, len(others)):
+        scene = request(model, *others[:count])
+        for coverage in (None, 0.5):
+            answer = questions.missing(model, scene, top_k=len(words), coverage=coverage)
+            p = {entry["label"]: entry["probability"] for entry in answer["missing"]}
+            assert p["hospital bed"] > 0.8, (count, coverage)
+    room = words.room_index("patient room")
+    generated = questions.generate(model, Scene((), room_type=room), seed=1, count=20)["scenes"]
+    assert sum("hospital bed" in one["objects"] for one in generated) >= 17
