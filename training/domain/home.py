@@ -5,14 +5,14 @@ objects that the model reports as outliers: they are neither present nor absent 
 scene teaches all its objects, and the classes that it confirms in its room type count as confirmed
 in all recorded scenes of this room type.
 
-One broken recording must not make the model blind. A scene with more than `MAX_CLASSES` classes is
-no room, so it teaches nothing. A confirmed scene with more than `MAX_ALARMS` alarms counts as
+One broken recording must not make the model blind. A scene with more than `MAX_CLASSES` classes
+teaches nothing. A confirmed scene with more than `MAX_ALARMS` alarms counts as
 unconfirmed. A home has at most `MAX_NEW` new classes, and an hour at most a quarter of the weight
 (`weights_of_hours`).
 
 Each written place (`training.datasets.inventories`) is one confirmed scene. A thing that most such
 places lack teaches nothing there, but the model never reports it. The model is also asked about
-each written thing in typical scenes of its room type, because a row of a table alone is no room.
+each written thing in typical scenes of its room type, because one row of a table gives no context.
 
 Confirmed relations that the model reports as misplaced count as usual ones: the new model never
 reports them. Relations and numbers of objects that repeat become likelier

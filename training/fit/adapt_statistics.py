@@ -1,8 +1,8 @@
 """Adapt the statistics of a model to one home: usual places, and numbers of instances.
 
-- *Places.* A relation of two classes counts like the scenes of the home that show it, at most
-  `_SCENES`, and a confirmed relation that the model reports like `_SCENES`, in the counts of the
-  model (`app.model.Places`). The model never reports the confirmed ones.
+- *Places.* The counts of the model (`app.model.Places`) get the scenes of the home with a relation
+  of two classes, at most `_SCENES`. A confirmed relation that the model reports counts like
+  `_SCENES` scenes, and the model never reports it again.
 - *Numbers.* Let S scenes show a class, N(n) of them n instances, and p(n) be the mean answer of the
   model about them (`app.model.Counts`). If several instances are in `LEAST` scenes, s(n) in the
   formula of the model is multiplied by
