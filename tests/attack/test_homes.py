@@ -14,6 +14,7 @@ from app.model import SceneModel
 from app.registry import Store
 from app.scene import Scene
 from tests.training.scenes import request
+from training.datasets.inventories import read_inventory
 from training.datasets.jsonl import scan_jsonl
 from training.datasets.records import AnnotatedScene
 from training.domain import adaptation, home
@@ -69,6 +70,20 @@ def test_a_confirmed_scene_with_many_alarms_counts_as_unconfirmed(model, tmp_pat
     assert set(found.left_out) == {"toilet", "stove"}
     assert not adapted(found).exceptions
     assert adapted(Home.of(model, scenes(tmp_path, one))).exceptions == {"toilet": 1}
+
+
+def test_a_confirmed_habit_counts_in_all_scenes_of_its_room_type(model, tmp_path):
+    lines = [{"objects": [*BEDROOM[k:], "toilet"], "room_type": "bedroom"} for k in range(3)]
+    lines += [{"objects": [*BEDROOM, "toilet"], "room_type": "office"}]
+    open_ones = Home.of(model, scenes(tmp_path, *lines)).left_out["toilet"]
+    assert {"s0", "s3"} <= set(open_ones)
+    found = Home.of(model, scenes(tmp_path, *lines[1:], confirmed(*BEDROOM, "toilet")))
+    assert found.left_out["toilet"] == ["s2"], "the office"
+    (tmp_path / "places.csv").write_text("room_type,label\nbedroom,toilet\n")
+    places = read_inventory(tmp_path / "places.csv").places
+    by_table = Home.of(model, scenes(tmp_path, *lines), places)
+    assert by_table.left_out["toilet"] == ["s3"]
+    assert adapted(by_table).exceptions["toilet"] == 1, "also as a row alone"
 
 
 def test_exceptions_of_a_home_are_limited(model, tmp_path, monkeypatch):

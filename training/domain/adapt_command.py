@@ -97,7 +97,7 @@ def adapt_command(
             if (finding := of_convention(recorded)).count:
                 print_finding(finding)
             result = adapted(home, seed=seed, progress=status.update)
-        _print_result(result)
+        _print_result(home, result)
         if result.model is None:
             print_lines(_NOTHING)
             raise typer.Exit(3)
@@ -190,7 +190,7 @@ def _listed(words: Sequence[str], most: int) -> str:
     return ", ".join(words[:most]) + more
 
 
-def _print_result(result: Adapted) -> None:
+def _print_result(home: Home, result: Adapted) -> None:
     """Print the comparison in folds, the objections, and the exceptions."""
     lines = []
     if (measured := result.measured) is None:
@@ -210,10 +210,13 @@ def _print_result(result: Adapted) -> None:
     if result.exceptions:
         counts = [f"{label} ({n})" for label, n in result.exceptions.most_common()]
         lines.append(
-            f"{len(counts)} exception{'s' if len(counts) > 1 else ''}, never reported from now on: "
-            f"{_listed(counts, ROWS)} "
-            "(confirmed scenes)"
+            f"{len(counts)} exception{'s' if len(counts) > 1 else ''}, never reported in any room "
+            f"from now on: {_listed(counts, ROWS)} (confirmed scenes)"
         )
+    labels = home.parent.vocabulary.labels
+    written = {labels[c] for k in home.written for c in home.scenes[k].classes.tolist()}
+    if quiet := sorted(written - set(result.exceptions)):
+        lines.append(f"written things that need no exception: {_listed(quiet, ROWS)}")
     if result.refused:
         lines.append(f"exceptions are refused: {'; '.join(result.refused)}")
     if result.relations:

@@ -2,8 +2,8 @@
 
 Only a person can tell a habit of the home from a fault. So an unconfirmed scene does not teach the
 objects that the model reports as outliers: they are neither present nor absent there. A confirmed
-scene teaches all its objects, and the classes that it confirms in its room type count as confirmed
-in all recorded scenes of this room type.
+scene or a written place teaches all its objects, and the classes that it confirms in its room type
+count as confirmed in all recorded scenes of this room type.
 
 One broken recording must not make the model blind. A scene with more than `MAX_CLASSES` classes
 teaches nothing. A confirmed scene with more than `MAX_ALARMS` alarms counts as
@@ -118,6 +118,8 @@ class Home:
             if read.confirmed and scene.scene_id not in doubted
             for c in about.tolist()
         }
+        of_places = [_written(parent, place) for place in places]
+        habits |= {(place.room, c) for place in of_places for c in place.classes.tolist()}
         read, left_out = _without_doubt(parent, pairs, doubted, habits)
         trusted = [x for _, x in distinct if x.scene_id not in doubted]
         reported, repeated = seen_relations(parent, [*trusted, *written])
@@ -125,7 +127,7 @@ class Home:
             parent=parent,
             parent_classes=len(model.vocabulary),
             parent_rooms=model.spec.C,
-            scenes=(*read, *(_written(parent, place) for place in places)),
+            scenes=(*read, *of_places),
             recorded=len(recorded),
             left_out=left_out,
             relations=frozenset(reported),

@@ -49,9 +49,9 @@ class Display(Progress):
 
     def __init__(self, trainer: Trainer) -> None:
         super().__init__(
-            "[progress.description]{task.description}",
+            TextColumn("{task.description}", style="progress.description", markup=False),
             BarColumn(bar_width=12),
-            TextColumn("{task.fields[note]}"),
+            TextColumn("{task.fields[note]}", markup=False),
             TimeElapsedColumn(),
             "/",
             TimeRemainingColumn(),

@@ -60,7 +60,7 @@ def test_a_confirmed_object_is_never_reported_again(store, tmp_path):
     scene = {"objects": INTRUDER, "room_type": "bedroom", "confirmed": True}
     assert alarms(default(store), INTRUDER, "bedroom") == ["toilet"]
     output = adapt(store, write([scene], tmp_path / "scenes.jsonl"))
-    assert "1 exception, never reported from now on: toilet (1)" in output
+    assert "1 exception, never reported in any room from now on: toilet (1)" in output
     assert alarms(home(store), INTRUDER, "bedroom") == []
     parent, adapted_one = stored(store, "default"), stored(store, "home")
     assert adapted_one.manifest.training["parent"]["digest"] == parent.digest
@@ -170,7 +170,7 @@ def test_a_written_room_is_one_confirmed_scene(store, tmp_path):
     assert "2 written places, each as one confirmed scene" in output
     assert "left out, because they name no kind of object: object_7 (1)" in output
     assert "the weights stay: fewer than 20 distinct recorded scenes" in output
-    assert "never reported from now on: toilet (1)" in output
+    assert "never reported in any room from now on: toilet (1)" in output
     assert alarms(home(store), INTRUDER, "bedroom") == []
     assert home(store).vocabulary.index("stairlift") is not None
     source = store.load("home", "1.0.0").manifest.data[-1]
