@@ -23,11 +23,11 @@ from training.domain.adaptation import adapted
 from training.domain.home import (
     MAX_ALARMS,
     MAX_CLASSES,
-    MAX_NEW,
     Home,
     weights_of_hours,
     with_exceptions,
 )
+from training.domain.own_words import MAX_NEW
 from training.domain.true_intruders import lost, true_intruders
 
 BEDROOM = ["bed", "nightstand", "pillow", "wardrobe", "lamp", "curtain"]
@@ -45,6 +45,12 @@ def scenes(tmp_path: Path, *lines: dict[str, Any]) -> list[AnnotatedScene]:
         "".join(json.dumps({"scene_id": f"s{k}"} | x) + "\n" for k, x in enumerate(lines))
     )
     return [scene for scene in scan_jsonl(path) if isinstance(scene, AnnotatedScene)]
+
+
+def test_empty_scenes_teach_nothing(model, tmp_path):
+    lines = [{"objects": []}, {"objects": ["floor"]}, confirmed()]
+    result = adapted(Home.of(model, scenes(tmp_path, *lines)))
+    assert (result.model, result.exceptions) == (None, {})
 
 
 def confirmed(*objects: str) -> dict[str, Any]:

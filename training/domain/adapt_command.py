@@ -32,9 +32,10 @@ from training.datasets.console import console, print_lines
 from training.datasets.records import digest_of
 from training.datasets.vocabulary import left_out_line
 from training.domain.adaptation import FEWEST, Adapted, Measured, adapted
-from training.domain.home import JUDGED, MAX_ALARMS, MAX_CLASSES, Home, confirmed_scene
+from training.domain.home import MAX_ALARMS, MAX_CLASSES, Home, confirmed_scene
 from training.domain.look import of_convention
 from training.domain.material import read_material
+from training.domain.own_words import JUDGED
 from training.domain.terminal import ROWS, StorePath, fail, print_finding
 from training.evaluation.metrics import Ratio
 from training.fit.configuration import ConfigError

@@ -7,8 +7,7 @@ count as confirmed in all recorded scenes of this room type.
 
 One broken recording must not make the model blind. A scene with more than `MAX_CLASSES` classes
 teaches nothing. A confirmed scene with more than `MAX_ALARMS` alarms counts as
-unconfirmed. A home has at most `MAX_NEW` new classes, and an hour at most a quarter of the weight
-(`weights_of_hours`).
+unconfirmed. An hour has at most a quarter of the weight (`weights_of_hours`).
 
 Each written place (`training.datasets.inventories`) is one confirmed scene. A thing that most such
 places lack teaches nothing there, but the model never reports it. The model is also asked about
@@ -17,8 +16,6 @@ each written thing in typical scenes of its room type, because one row of a tabl
 Confirmed relations that the model reports as misplaced count as usual ones: the new model never
 reports them. Relations and numbers of objects that repeat become likelier
 (`training.fit.adapt_statistics`).
-
-A label that the model cannot read becomes a new class. It is judged once `JUDGED` scenes show it.
 """
 
 from __future__ import annotations
@@ -37,23 +34,21 @@ from numpy.typing import NDArray
 from app.model import SceneModel
 from app.questions.misplaced import THE_FLOOR
 from app.questions.outliers import intruders
-from app.scene import ObjectClass, Scene, Vocabulary, label_key
+from app.scene import Scene, Vocabulary
 from app.scene.spatial_relations import STACKED
 from training.datasets import AnnotatedScene, encode
 from training.datasets.cases import Triple, scene_of
 from training.datasets.inventories import SHARE, Place, complete_scene, shipped_inventory
 from training.datasets.moved import has_boxes, posed_scene
 from training.datasets.vocabulary import curated_names
+from training.domain.own_words import JUDGED, with_new_words
 from training.evaluation.asking import canonical_triple, index_of_ids, score_misplaced
 from training.evaluation.parts import of_classes
-from training.fit.adapt import HomeScenes, TrainedOn, extended
+from training.fit.adapt import HomeScenes, TrainedOn
 from training.fit.adapt_statistics import Numbers
 
-JUDGED: Final = 3  # number of scenes with a new class from which its objects are judged
 MAX_CLASSES: Final = 64  # of a recorded scene
 MAX_ALARMS: Final = 12  # of a confirmed scene
-MAX_NEW: Final = 200  # new classes of a home
-MAX_NEW_ROOMS: Final = 32
 MAX_EXCEPTIONS: Final = 64  # classes of a home that the model never reports
 
 _LEAST_OF_HOUR, _SHARE_OF_HOUR = 20.0, 0.25
@@ -105,35 +100,32 @@ class Home:
         Scenes with equal classes and room type count once, because a robot sees a room many times.
         """
         written = [*map(confirmed_scene, places)]
-        parent, unlearnt = _with_new_words(model, [*recorded, *written])
+        parent, unlearnt = with_new_words(model, [*recorded, *written])
         distinct, too_large = _distinct(parent, recorded)
-        alarms = [alarms_of(parent, read.question) for read, _ in distinct]
-        pairs = [*zip(distinct, alarms, strict=True)]
         doubted = {
-            x.scene_id for (read, x), about in pairs if read.confirmed and len(about) > MAX_ALARMS
-        }
-        habits = {
-            (read.room, c)
-            for (read, scene), about in pairs
-            if read.confirmed and scene.scene_id not in doubted
-            for c in about.tolist()
+            scene.scene_id
+            for read, scene in distinct
+            if read.confirmed and len(read.left_out) > MAX_ALARMS
         }
         of_places = [_written(parent, place) for place in places]
-        habits |= {(place.room, c) for place in of_places for c in place.classes.tolist()}
-        read, left_out = _without_doubt(parent, pairs, doubted, habits)
+        habits = {(place.room, c) for place in of_places for c in place.classes.tolist()}
+        for read, scene in distinct:
+            if read.confirmed and scene.scene_id not in doubted:
+                habits.update((read.room, c) for c in read.left_out.tolist())
+        scenes, left_out = _without_doubt(parent, distinct, doubted, habits)
         trusted = [x for _, x in distinct if x.scene_id not in doubted]
         reported, repeated = seen_relations(parent, [*trusted, *written])
         return cls(
             parent=parent,
             parent_classes=len(model.vocabulary),
             parent_rooms=model.spec.C,
-            scenes=(*read, *of_places),
+            scenes=(*scenes, *of_places),
             recorded=len(recorded),
             left_out=left_out,
             relations=frozenset(reported),
             places={triple: n for triple, n in repeated.items() if n >= JUDGED},
             numbers=tuple(
-                _numbers(parent, x, one) for one, (_, x) in zip(read, distinct, strict=True)
+                _numbers(parent, x, one) for one, (_, x) in zip(scenes, distinct, strict=True)
             ),
             unlearnt=unlearnt,
             too_large=too_large,
@@ -191,7 +183,7 @@ class Home:
         """Return the classes that a model reports, with the number of their confirmed scenes."""
         labels, counts = artifact.vocabulary.labels, Counter[str]()
         for scene in self.scenes:
-            if scene.confirmed and len(scene.classes):
+            if scene.confirmed:
                 alarms = set(alarms_of(artifact, scene.question).tolist())
                 if scene.written:
                     alarms |= self._typical_alarms(artifact, scene)
@@ -246,41 +238,16 @@ def weights_of_hours(groups: Sequence[str | None]) -> Float[NDArray[np.float64],
     return weights
 
 
-def _with_new_words(
-    model: SceneModel, recorded: Sequence[AnnotatedScene]
-) -> tuple[SceneModel, tuple[str, ...]]:
-    """Return the model with the words that it cannot read, and the words beyond the limits."""
-    names, vocabulary = curated_names(), model.vocabulary
-    scenes_of: Counter[str] = Counter()
-    rooms_of: Counter[str] = Counter()
-    for scene in recorded:
-        labels = {label_key(thing.label): thing.label for thing in scene.objects}.values()
-        scenes_of.update({names.canonical(x) for x in labels if vocabulary.look_up(x) is None})
-        room = names.canonical_room(scene.room_type)
-        if room is not None and names.room_index(scene.room_type, vocabulary) is None:
-            rooms_of[room] += 1
-    excluded = set(map(label_key, (*names.not_objects, *names.structure)))
-    words = [x for x in _commonest(scenes_of) if label_key(x) and label_key(x) not in excluded]
-    rooms = _commonest(rooms_of)
-    classes = [ObjectClass(x, anywhere=scenes_of[x] < JUDGED) for x in sorted(words[:MAX_NEW])]
-    new_rooms = sorted(rooms[:MAX_NEW_ROOMS]) if model.spec.C else ()
-    return extended(model, classes, new_rooms), (*words[MAX_NEW:], *rooms[MAX_NEW_ROOMS:])
-
-
-def _commonest(counts: Counter[str]) -> list[str]:
-    """Return the words, the commonest first, one for each key."""
-    ordered = sorted(counts, key=lambda word: (-counts[word], word))
-    by_key = {label_key(word): word for word in reversed(ordered)}
-    return [word for word in ordered if by_key[label_key(word)] == word]
-
-
 _Distinct = list[tuple["HomeScene", AnnotatedScene]]
 
 
 def _distinct(
     parent: SceneModel, recorded: Sequence[AnnotatedScene]
 ) -> tuple[_Distinct, tuple[str, ...]]:
-    """Return one scene for equal classes and room types, and the ids of too large scenes."""
+    """Return one scene for equal classes and room types, and the ids of too large scenes.
+
+    Each scene leaves out the classes that the parent reports in it.
+    """
     scenes: dict[tuple[object, ...], tuple[HomeScene, AnnotatedScene]] = {}
     too_large = []
     for scene in recorded:
@@ -291,19 +258,23 @@ def _distinct(
         key = (read.room, read.classes.tobytes())
         if key not in scenes or read.confirmed:
             scenes[key] = read, scene
-    return [*scenes.values()], tuple(too_large)
+    distinct = [
+        (replace(read, left_out=alarms_of(parent, read.question)), scene)
+        for read, scene in scenes.values()
+    ]
+    return distinct, tuple(too_large)
 
 
 def _without_doubt(
     parent: SceneModel,
-    pairs: Iterable[tuple[tuple[HomeScene, AnnotatedScene], Int[NDArray, "n"]]],
+    distinct: _Distinct,
     doubted: Collection[str],
     habits: Collection[tuple[int | None, int]],
 ) -> tuple[list[HomeScene], dict[str, list[str]]]:
     """Return the scenes without unconfirmed alarms, and the ids of the scenes with each of them."""
     scenes, left_out = [], defaultdict[str, list[str]](list)
-    for (read, scene), alarms in pairs:
-        open_ones = [c for c in alarms.tolist() if (read.room, c) not in habits]
+    for read, scene in distinct:
+        open_ones = [c for c in read.left_out.tolist() if (read.room, c) not in habits]
         confirmed = read.confirmed and scene.scene_id not in doubted
         rows = np.array([] if confirmed else open_ones, dtype=np.int64)
         scenes.append(replace(read, left_out=rows, confirmed=confirmed))
@@ -350,6 +321,8 @@ def _written(parent: SceneModel, place: Place) -> HomeScene:
 
 def alarms_of(artifact: SceneModel, scene: Scene) -> Int[NDArray, "n"]:
     """Return the classes that `/outliers` reports at medium sensitivity."""
+    if not scene.objects:
+        return np.zeros(0, np.int64)
     classes = intruders(artifact, scene)
     return classes[~artifact.rarely_shown[classes]]
 
