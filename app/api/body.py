@@ -19,6 +19,7 @@ from starlette.requests import Request
 from starlette.types import Receive, Scope, Send
 
 from app import errors
+from app.questions.reading import Limits
 from app.serving.admission import SMALL, Bodies
 from app.serving.runtime import Runtime
 from scene_client.schemas import MAX_BATCH, FieldError
@@ -39,15 +40,15 @@ _MARK: Final = re.compile(r"[ \t\n\r]*([{}\[\],:])[ \t\n\r]*")
 _PART: Final = 64 * 1024
 
 
-def validated(value: Any, form: type[FormT], *, at: errors.Location = ()) -> FormT:
+def validated(value: Any, form: type[FormT], limits: Limits, *, at: errors.Location = ()) -> FormT:
     """Validate the JSON value at a location. Refuse too long lists before their validation.
 
     Raises:
-        InvalidRequestError: the value does not match the schema.
+        InvalidRequestError: the value does not match the schema, or a scene has too many relations.
     """
     too_long = [
         _too_many(pointer((*at, name)), most)
-        for name, most in _most_entries(form).items()
+        for name, most in _most_entries(form, limits.relations).items()
         if isinstance(value, dict) and isinstance(value.get(name), list) and len(value[name]) > most
     ]
     if too_long:
@@ -64,12 +65,17 @@ def _too_many(at: str, most: int) -> FieldError:
 
 
 @cache
-def _most_entries(form: type[Form]) -> dict[str, int]:
-    """Return the maximum length of each list (and text) among the fields of a schema."""
+def _most_entries(form: type[Form], relations: int) -> dict[str, int]:
+    """Return the maximum length of each list (and text) among the fields of a schema.
+
+    The validation of 65,536 relations, the limit of the schema, would hold the interpreter for
+    0.1 s. So ``relations``, the limit of the service, replaces it.
+    """
     limits = (
         (name, limit) for name, field in form.model_fields.items() for limit in field.metadata
     )
-    return {name: limit.max_length for name, limit in limits if hasattr(limit, "max_length")}
+    most = {name: limit.max_length for name, limit in limits if hasattr(limit, "max_length")}
+    return most | {"relations": relations} if "relations" in most else most
 
 
 def parse(body: bytes, most: int) -> Any:
@@ -264,7 +270,7 @@ class JSONRoute(APIRoute):
 
         def read(_: object) -> tuple[Any, Any]:
             value = parse(body, most)
-            return value, validated(value, schema)
+            return value, validated(value, schema, runtime.limits)
 
         if len(body) <= SMALL:
             value, data = read(None)

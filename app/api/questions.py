@@ -26,7 +26,7 @@ from app.questions.reading import Limits, Reading, read_scene, together
 from app.questions.several_rooms import several_rooms
 from app.registry import Artifact
 from app.scene.vocabulary import Vocabulary
-from app.serving.admission import Admission, Ticket, in_thread
+from app.serving.admission import Ticket, in_thread
 from app.serving.models import ServedModels
 from app.serving.runtime import Runtime
 from scene_client.schemas import MAX_BATCH, BatchAnswer, BatchRequest, SceneRequest, WhereRequest
@@ -233,7 +233,7 @@ async def _answer_each(
             if left_bytes <= 0:
                 raise AnswerTooLargeError([LocatedError((), _FULL)])
             ticket.check()
-            data = await _validated(scene, question, number, admission, ticket)
+            data = await _validated(scene, question, number, runtime, ticket)
             answer = await _answer(http, question, data, models, look_ups, left_bytes)
             outcome, result = SUCCESS, b'{"status":200,"result":%b}' % answer
         except Exception as error:  # noqa: BLE001 — any error fails only this scene
@@ -247,13 +247,14 @@ async def _answer_each(
 
 
 async def _validated(
-    scene: Any, question: Question[RequestT], number: int, admission: Admission, ticket: Ticket
+    scene: Any, question: Question[RequestT], number: int, runtime: Runtime, ticket: Ticket
 ) -> RequestT:
     """Validate a scene of a batch. The worker thread validates large scenes."""
-    validate = partial(validated, scene, question.request, at=("scenes", number))
+    at = "scenes", number
+    validate = partial(validated, scene, question.request, runtime.limits, at=at)
     if not isinstance(scene, dict) or is_small(scene):
         return validate()
-    return await admission.in_worker(ticket, lambda _: validate())
+    return await runtime.admission.in_worker(ticket, lambda _: validate())
 
 
 def _failed(error: Exception, number: int, scene: Any, request_id: str) -> tuple[str, bytes]:

@@ -291,9 +291,9 @@ def _profile(name: str, profiles: Sequence[str], errors: ErrorList) -> int | Non
 
 def _check_fields(request: SceneRequest, limits: Limits, errors: ErrorList) -> None:
     """Refuse a scene that is too large or contradictory, before any costly step."""
-    for name, most in (("objects", limits.objects), ("relations", limits.relations)):
-        if len(getattr(request, name) or ()) > most:
-            errors.add(InvalidRequestError, (name,), f"the scene must have at most {most} {name}")
+    if len(request.objects) > limits.objects:
+        message = f"the scene must have at most {limits.objects} objects"
+        errors.add(InvalidRequestError, ("objects",), message)
     several = [one for one in request.objects if not isinstance(one, str) and one.alternatives]
     if sum(1 + len(one.alternatives) for one in several) > _MOST_LABELS:
         message = f"objects with alternatives must have at most {_MOST_LABELS} labels together"

@@ -28,6 +28,7 @@ from tests.http.test_problems import problem
 from tests.services import Replace, client_of_service, serve
 
 JSON = {"Content-Type": "application/json"}
+LEFT = ["bed", "left", "lamp"]
 
 
 @pytest.mark.parametrize(
@@ -36,7 +37,7 @@ JSON = {"Content-Type": "application/json"}
         ("missing", "objects", {}, 256),
         ("missing", "candidates", 7, 4096),
         ("relations", "pairs", [], 4096),
-        ("outliers", "relations", 7, 65536),
+        ("outliers", "relations", 7, 4096),
         ("outliers/batch", "scenes", {}, 256),
         ("where", "rooms", {}, 32),
         ("where", "searched", 7, 1024),
@@ -49,6 +50,24 @@ async def test_entries_are_counted_before_validation(client, path, field, entry,
     document = problem(await client.post(f"/{path}", json=body), 422, "invalid-request")
     errors = [(error["pointer"], error["message"]) for error in document["errors"]]
     assert errors == [(f"#/{field}", f"must have at most {most} entries")]
+
+
+async def test_relations_are_counted_before_validation(shared_store, monkeypatch):
+    """The setting decides, in batches too: the limit of the schema would take 0.1 s."""
+    validations = list[Any]()
+    validate = MissingRequest.model_validate
+    monkeypatch.setattr(
+        MissingRequest, "model_validate", lambda value: validations.append(value) or validate(value)
+    )
+    few, many = ({"objects": ["bed", "lamp"], "relations": [LEFT] * most} for most in (2, 3))
+    async with serve(shared_store, max_relations=2) as client:
+        answer = await client.post("/missing/batch", json={"scenes": [few, many]})
+        problem(await client.post("/missing", json=many), 422, "invalid-request")
+    answered, refused = answer.json()["results"]
+    assert (answered["status"], validations) == (200, [few])
+    (error,) = refused["problem"]["errors"]
+    assert error["pointer"] == "#/scenes/1/relations"
+    assert error["message"] == "must have at most 2 entries"
 
 
 @pytest.fixture
