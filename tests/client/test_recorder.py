@@ -308,7 +308,7 @@ for turn in range(60):
 Recorder(sys.argv[1], most_bytes=2**40).record([scene("last")])
 print(torn, "torn")
 """, file)  # fmt: skip
-    assert killed.endswith("torn\n")
+    assert " torn\n" in killed  # beside warnings about unreadable ends
     written = labels(file)
     assert len(written) > 30
     assert written[-1][0].startswith("last")

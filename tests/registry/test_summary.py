@@ -126,7 +126,7 @@ def test_a_home_names_its_parent_and_its_own_scenes() -> None:
 
 
 def test_the_sentences_precede_the_tables_of_the_card() -> None:
-    one = description(data=[source("a|b\n\n# Heading", research_only=True)])
+    one = description(data=[source("a|b # Heading", research_only=True)])
     lines = render_card(one, {}).split("## Model")[0].splitlines()
     assert lines[0] == "# tiny 1.0.0"
     listed = [line.removeprefix("- ") for line in lines if line.startswith("- ")]
