@@ -186,3 +186,9 @@ def marked(text: str) -> Any:
 def test_a_pattern_reads_short_texts_only(length: int, label: str) -> None:
     fields = from_data(marked("chair" + " " * length + " (.9)"))
     assert [one["label"] for one in fields["objects"]] == [label]
+
+
+@pytest.mark.parametrize("text", ["|", "|-|\n|", "| : - |"])
+async def test_a_table_without_cells_is_no_defect(client, text):
+    answer = await client.post("/scenes", json={"text": text})
+    assert answer.status_code in (200, 422)

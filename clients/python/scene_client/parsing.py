@@ -191,6 +191,8 @@ def _table(lines: list[str]) -> Rows | None:
     delimiter = max(",;\t|", key=lines[0].count)
     if delimiter == "|":  # of Markdown
         lines = [one.strip("| ") for one in lines if not re.fullmatch(r"[|:\- ]+", one)]
+        if not lines:
+            return None
     names = [name.strip().strip('"') for name in lines[0].split(delimiter)]
     keys = [key_of(name) for name in names]
     if len(names) < 2 or not set(FIELDS["label"]) & {*keys} or any(map(_is_number, names)):
