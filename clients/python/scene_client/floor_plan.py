@@ -17,7 +17,7 @@ class FloorPlan:
     """The polygons of the rooms by name. A plan without rooms is possible.
 
     Raises:
-        InvalidRequestError: a polygon has fewer than three corners, or is no list of corners.
+        InvalidRequestError: a polygon has fewer than three corners, or another form.
     """
 
     def __init__(self, rooms: Mapping[str, Iterable[Sequence[float]]]) -> None:
@@ -58,7 +58,7 @@ def pose_of(values: Sequence[float] | Mapping[str, float] | None) -> Vector | No
     """Return x, y and yaw; None if the robot is not located.
 
     Raises:
-        InvalidRequestError: the values are no pose.
+        InvalidRequestError: the values have another form than x, y, yaw.
     """
     if values is None:
         return None
